@@ -1,0 +1,1 @@
+"""Maps: files to `Network` (host, exact) to `LaneMap` (device arrays)."""
