@@ -1,0 +1,28 @@
+"""Set-up for all tests: strict JAX, caches of their own, and where the shared data lie."""
+
+import os
+import tempfile
+from pathlib import Path
+
+# A cache directory for this run alone: the user's own cache is neither read nor written.
+_cache = tempfile.TemporaryDirectory(prefix="limsim-jax-tests-")
+os.environ["LIMSIM_JAX_CACHE"] = _cache.name
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+# Compiled programs are kept between runs: most of the time of a test run is compilation.
+_programs = Path(tempfile.gettempdir()) / f"limsim-jax-tests-xla-{os.getuid()}"
+jax.config.update("jax_compilation_cache_dir", str(_programs))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+REPO = Path(__file__).resolve().parents[1]
+SHARED = Path(os.environ.get("LIMSIM_SHARED_DATA", REPO.parent / "shared" / "data"))
+"""Maps and recordings that are too large for the repository."""
+
+needs_shared = pytest.mark.skipif(
+    not SHARED.is_dir(), reason=f"no shared data at {SHARED}; set LIMSIM_SHARED_DATA to their folder"
+)
