@@ -1,1 +1,116 @@
 """Maps: files to `Network` (host, exact) to `LaneMap` (device arrays)."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from limsim_jax.maps import cache as _cache
+from limsim_jax.maps.network import MapError, Network
+
+if TYPE_CHECKING:
+    from limsim_jax.maps.lane_map import LaneMap
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+# What the cache may know about a network: its file and nothing but its file has shaped it.
+_loaded: weakref.WeakKeyDictionary[Network, tuple[str, ...]] = weakref.WeakKeyDictionary()
+
+
+def load_map(path: str | Path, *, cache: bool = True) -> Network:
+    """Read a road network from an OpenDRIVE (`.xodr`) or SUMO (`.net.xml`) file, also gzipped.
+
+    The root element decides which of the two it is. With `cache` the result is kept on disk
+    (`limsim_jax.maps.cache`), so that a second load of the same bytes is quick.
+
+    Raises `MapError`, one line that names file, line, element and reason, for any file that cannot
+    be used.
+    """
+    from limsim_jax.maps import xml
+
+    path = Path(path)
+    data = xml.read_bytes(path)
+    file_hash = xml.file_hash(data)
+    identity = (file_hash, path.name)  # a network without a name is named after its file
+    name = _cache.key("network", *identity)
+    network = _cache.load(name) if cache else None
+    if isinstance(network, Network):
+        network = dataclasses.replace(network, source=str(path))
+    else:
+        network = _read(path, _root_element(data, path))
+        if network.file_hash != file_hash:  # the file changed between the two looks at it
+            return network
+        if cache:
+            _cache.store(name, network)
+    _loaded[network] = identity
+    return network
+
+
+def build_lane_map(network: Network, goals: Sequence[str] | None = None, *, cache: bool = True) -> LaneMap:
+    """Turn a network into device arrays: see `limsim_jax.maps.lane_map.build_lane_map`.
+
+    With `cache` the arrays of a network that comes straight from `load_map` are kept on disk.
+    """
+    import jax
+    import numpy as np
+
+    from limsim_jax.maps import lane_map
+
+    identity = _loaded.get(network) if cache else None
+    if identity is None:
+        return lane_map.build_lane_map(network, goals)
+    name = _cache.key("lanes", *identity, repr(goals if goals is None else list(goals)))
+    built = _cache.load(name)
+    if isinstance(built, lane_map.LaneMap):
+        return jax.device_put(built)
+    built = lane_map.build_lane_map(network, goals)
+    _cache.store(name, jax.tree.map(np.asarray, built))
+    return built
+
+
+def bundled_maps() -> dict[str, Path]:
+    """The maps that come with the package: name to path, sorted by name."""
+    installed, checkout = _PACKAGE / "_bundled", _PACKAGE.parent / "maps"
+    folder = installed if installed.is_dir() else checkout
+    return {path.stem: path for path in sorted(folder.glob("*.xodr"))}
+
+
+def bundled_map(name: str) -> Path:
+    """The path of a map that comes with the package. Raises `MapError` if there is none of this name."""
+    maps = bundled_maps()
+    if name not in maps:
+        raise MapError(f"no such file, and no bundled map either; bundled are {', '.join(maps)}", file=name)
+    return maps[name]
+
+
+def _read(path: Path, root: str) -> Network:
+    if root == "OpenDRIVE":
+        from limsim_jax.maps.opendrive import read_opendrive
+
+        return read_opendrive(path)
+    if root == "net":
+        from limsim_jax.maps.sumo import read_sumo
+
+        return read_sumo(path)
+    raise MapError(
+        f"the root element is <{root}>; maps have <OpenDRIVE> (OpenDRIVE) or <net> (SUMO)", file=path, line=1
+    )
+
+
+def _root_element(data: bytes, path: Path) -> str:
+    """Local name of the root element; nothing after its start tag is parsed."""
+    from lxml import etree
+
+    try:
+        start = etree.iterparse(
+            io.BytesIO(data), events=("start",), resolve_entities=False, no_network=True, load_dtd=False
+        )
+        return etree.QName(next(iter(start))[1]).localname
+    except (etree.XMLSyntaxError, StopIteration) as error:
+        line = getattr(error, "lineno", None)
+        reason = getattr(error, "msg", "it has no root element")
+        raise MapError(f"not well-formed XML: {reason}", file=path, line=line) from None

@@ -1,0 +1,177 @@
+"""A cache on disk for what takes long to build from a map file.
+
+Entries lie in `$LIMSIM_JAX_CACHE`, else `$XDG_CACHE_HOME/limsim_jax`, else `~/.cache/limsim_jax`. The
+key of an entry covers the bytes of the map file and the source code that turns them into the entry, so
+an entry never goes stale: a changed file or another version of the package has another key.
+
+An entry is a pickle behind a header with its length and checksum. Pickle, because it is as fast as raw
+arrays here and keeps the types as they are; and harmless, because `_Unpickler` builds arrays, plain
+containers and the records of `limsim_jax.maps`, and nothing else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import enum
+import functools
+import gc
+import hashlib
+import io
+import logging
+import os
+import pickle
+import platform
+import struct
+import tempfile
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limsim_jax import __version__
+
+logger = logging.getLogger(__name__)
+
+MAX_BYTES = 2 << 30
+"""The directory is pruned to this size, least recently used entries first."""
+
+MAX_AGE = 90 * 24 * 3600.0
+"""Entries that were not used for so long (s) are removed."""
+
+_HEADER = struct.Struct("<8sQI")  # magic, payload length, CRC-32 of the payload
+_MAGIC = b"limsimjx"
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def directory() -> Path:
+    """The directory of the cache; it need not exist yet."""
+    if own := os.environ.get("LIMSIM_JAX_CACHE"):
+        return Path(own)
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "limsim_jax"
+
+
+def key(kind: str, *parts: str) -> str:
+    """File name of the entry of this kind for these parts (hashes, names, options)."""
+    digest = hashlib.sha256(_fingerprint())
+    for part in parts:
+        digest.update(struct.pack("<Q", len(part.encode())) + part.encode())
+    return f"{kind}-{digest.hexdigest()}"
+
+
+def load(name: str) -> Any | None:
+    """The entry, or None if there is none that can be used. A damaged one is logged and removed."""
+    try:
+        path = directory() / name
+        data = path.read_bytes()
+    except (OSError, RuntimeError):  # Path.home() raises RuntimeError where there is no home
+        return None
+    try:
+        value = _decode(data)
+    except Exception as error:  # whatever a damaged pickle raises
+        logger.warning("map cache: %s is damaged (%s); built anew", path, error)
+        with contextlib.suppress(OSError):
+            path.unlink()
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # most recently used
+    return value
+
+
+def store(name: str, value: Any) -> None:
+    """Write an entry, all of it or nothing. Where that is not possible, say so once and go on."""
+    try:
+        folder = directory()
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=folder, prefix=name, suffix=".tmp")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(_encode(value))
+            os.replace(temporary, folder / name)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
+            raise
+        _prune(folder)
+    except (OSError, RuntimeError) as error:
+        _warn_once(f"map cache: not kept, so maps load slowly every time ({error})")
+
+
+def _encode(value: Any) -> bytes:
+    payload = pickle.dumps(value, protocol=5)
+    return _HEADER.pack(_MAGIC, len(payload), zlib.crc32(payload)) + payload
+
+
+def _decode(data: bytes) -> Any:
+    if len(data) < _HEADER.size:
+        raise ValueError("truncated header")
+    magic, length, checksum = _HEADER.unpack_from(data)
+    payload = memoryview(data)[_HEADER.size :]
+    if magic != _MAGIC or length != len(payload) or checksum != zlib.crc32(payload):
+        raise ValueError("truncated or changed")
+    with _collector_off():  # it would walk the growing heap again and again: half of the time
+        return _Unpickler(io.BytesIO(payload)).load()
+
+
+@contextlib.contextmanager
+def _collector_off() -> Iterator[None]:
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+class _Unpickler(pickle.Unpickler):
+    """Builds arrays, plain containers and the records of `limsim_jax.maps`, and nothing else."""
+
+    def find_class(self, module_name: str, global_name: str, /) -> Any:
+        if (module_name, global_name) in _PLAIN:
+            return super().find_class(module_name, global_name)
+        if module_name.startswith("numpy.") and global_name in _NUMPY:
+            return super().find_class(module_name, global_name)
+        if module_name.startswith("limsim_jax.maps."):
+            found = super().find_class(module_name, global_name)
+            if isinstance(found, type) and (dataclasses.is_dataclass(found) or issubclass(found, enum.Enum)):
+                return found
+        raise pickle.UnpicklingError(f"{module_name}.{global_name} has no place in a map cache")
+
+
+_PLAIN = {("builtins", "frozenset"), ("collections", "Counter"), ("numpy", "dtype"), ("numpy", "ndarray")}
+_NUMPY = {"_frombuffer", "_reconstruct", "scalar"}  # how NumPy pickles arrays and numbers
+
+
+@functools.cache
+def _fingerprint() -> bytes:
+    """Hash of all that shapes an entry besides the map file: our source and the versions beneath it."""
+    digest = hashlib.sha256(repr((__version__, platform.python_version_tuple()[:2], np.__version__)).encode())
+    for path in sorted([*_PACKAGE.glob("maps/**/*.py"), *_PACKAGE.glob("*.py")]):
+        digest.update(path.read_bytes())
+    return digest.digest()
+
+
+def _prune(folder: Path) -> None:
+    """Remove entries that are old or too much, and what writers that died have left."""
+    files = []
+    for path in folder.iterdir():
+        with contextlib.suppress(OSError):  # another process may prune, too
+            stat = path.stat()
+            files.append((stat.st_mtime, stat.st_size, path))
+    now, total = time.time(), 0
+    for used, size, path in sorted(files, reverse=True):
+        total += size
+        dead = path.suffix == ".tmp" and now - used > 3600
+        if dead or now - used > MAX_AGE or total > MAX_BYTES:
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    logger.warning(message)
