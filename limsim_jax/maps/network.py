@@ -85,16 +85,20 @@ class ImportReport:
         """Record an element that was taken over, but not exactly."""
         self._note(Action.APPROXIMATED, element, where, message, line)
 
-    def ignored(self, element: str, where: str, message: str, line: int | None = None) -> None:
-        """Record an element that was not taken over."""
-        self._note(Action.IGNORED, element, where, message, line)
+    def ignored(
+        self, element: str, where: str, message: str, line: int | None = None, *, count: int = 1
+    ) -> None:
+        """Record an element that was not taken over, or with `count` several alike in one note."""
+        self._note(Action.IGNORED, element, where, message, line, count)
 
     def repaired(self, element: str, where: str, message: str, line: int | None = None) -> None:
         """Record an element that is broken in the file and was mended."""
         self._note(Action.REPAIRED, element, where, message, line)
 
-    def _note(self, action: Action, element: str, where: str, message: str, line: int | None) -> None:
-        self.counts[element, action] += 1
+    def _note(
+        self, action: Action, element: str, where: str, message: str, line: int | None, count: int = 1
+    ) -> None:
+        self.counts[element, action] += count
         self.notes.append(Note(action=action, element=element, where=where, message=message, line=line))
 
     def elements(self) -> list[str]:

@@ -1,0 +1,670 @@
+"""What the file says, element by element: XML to plain records, nothing interpreted yet.
+
+Every child element is either taken or counted: `Ignored` collects what has no meaning here, so that
+the import report can name it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from limsim_jax.maps.network import ImportReport
+from limsim_jax.maps.opendrive.curves import Cubics, Geometry, Kind, ReferenceLine
+from limsim_jax.maps.xml import Element, Reader
+
+SPEED_UNITS = {"": 1.0, "m/s": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "mph": 0.44704}
+
+# without a meaning for motion: appearance, surface friction, sound, tool-specific data
+_NO_MEANING = {
+    "userData": "tool-specific data",
+    "include": "included files are not opened",
+    "dataQuality": "data quality",
+    "surface": "road surface",
+    "railroad": "railway data",
+    "material": "lane surface",
+    "height": "lane height above the road plane",
+    "crossfall": "cross slope",
+    "shape": "road cross section",
+    "crossSectionSurface": "road cross section",
+    "rule": "free-text rule",
+    "fillet": "tool-specific data",
+    "planElevation": "junction surface",
+    "elevationGrid": "junction surface",
+    "boundary": "junction boundary",
+    "surfaceStrip": "road surface",
+}
+
+
+class Ignored:
+    """Elements that are not taken over, by tag: how many, and the first place."""
+
+    def __init__(self) -> None:
+        self.count: Counter[str] = Counter()
+        self.first: dict[str, tuple[str, int | None]] = {}
+
+    def add(self, element: Element, where: str) -> None:
+        parent = element.getparent()
+        name = element.tag if parent is None else f"{parent.tag}/{element.tag}"
+        self.count[name] += 1
+        self.first.setdefault(name, (where, element.sourceline))
+
+    def report(self, report: ImportReport) -> None:
+        """One line per kind of element."""
+        for name, count in sorted(self.count.items()):
+            where, line = self.first[name]
+            reason = _NO_MEANING.get(name.rpartition("/")[2], "not known to this reader")
+            message = f"{reason}; {count} in the file, the first here"
+            report.ignored(name, where, message, line, count=count)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoadLink:
+    """Road `predecessor` or `successor`."""
+
+    is_junction: bool
+    id: str
+    contact: str = ""  # start, end
+    s: float | None = None  # virtual junctions: where on the other road
+    direction: str = ""  # virtual junctions: + or -
+    line: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mark:
+    """Road mark on the outer border of a lane, from `s` (m from the section start) on."""
+
+    s: float
+    type: str
+    change: str | None  # increase, decrease, both, none
+    rules: tuple[str, ...] = ()
+
+
+@dataclass(kw_only=True)
+class RawLane:
+    """Lane of a lane section."""
+
+    id: int
+    type: str
+    forward_sign: int = 0  # 1.8 `direction`: 0 standard, 1 reversed, 2 both
+    predecessors: tuple[int, ...] = ()
+    successors: tuple[int, ...] = ()
+    width: Cubics | None = None
+    border: Cubics | None = None
+    marks: list[Mark] = field(default_factory=list)
+    speeds: list[tuple[float, float]] = field(default_factory=list)  # (s from section start, m/s)
+    access: list[tuple[float, str, tuple[str, ...]]] = field(default_factory=list)  # s, rule, who
+    line: int | None = None
+
+
+@dataclass(kw_only=True)
+class RawSection:
+    """Lane section; `end` is where the next one starts."""
+
+    s: float
+    end: float = 0.0
+    lanes: dict[int, RawLane] = field(default_factory=dict)
+    line: int | None = None
+
+
+@dataclass(kw_only=True)
+class RawSignal:
+    """`signal` or `signalReference` (then the attributes of the signal itself are empty)."""
+
+    id: str
+    s: float
+    t: float
+    z: float = 0.0
+    orientation: str
+    validity: list[tuple[int, int]]
+    reference: bool = False
+    name: str = ""
+    type: str = ""
+    subtype: str = ""
+    country: str = ""
+    dynamic: bool = False
+    value: float | None = None
+    unit: str = ""
+    heading_offset: float = 0.0
+    line: int | None = None
+
+
+@dataclass(kw_only=True)
+class RawObject:
+    """`object` that lies flat on the road: crosswalks and painted bars."""
+
+    id: str
+    type: str
+    subtype: str
+    name: str
+    s: float
+    t: float
+    z: float
+    heading: float
+    length: float
+    width: float
+    height: float
+    outlines: list[list[tuple[bool, float, float]]]  # (is cornerRoad, u or s, v or t)
+    validity: list[tuple[int, int]]
+    line: int | None = None
+
+
+@dataclass(kw_only=True)
+class RawRoad:
+    """Road."""
+
+    id: str
+    name: str
+    length: float
+    junction: str | None
+    left_hand: bool
+    predecessor: RoadLink | None = None
+    successor: RoadLink | None = None
+    types: list[tuple[float, str, float | None]] = field(default_factory=list)  # s, type, m/s
+    reference: ReferenceLine = field(default_factory=lambda: ReferenceLine([]))
+    offset: Cubics = field(default_factory=lambda: Cubics([]))
+    elevation: Cubics = field(default_factory=lambda: Cubics([]))
+    superelevation: Cubics = field(default_factory=lambda: Cubics([]))
+    sections: list[RawSection] = field(default_factory=list)
+    signals: list[RawSignal] = field(default_factory=list)
+    objects: list[RawObject] = field(default_factory=list)
+    line: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawConnection:
+    """`connection` of a junction; `road` is the connecting (or, in direct junctions, the linked) road."""
+
+    incoming: str | None
+    road: str
+    contact: str
+    lanes: tuple[tuple[int, int], ...]
+    line: int | None = None
+
+
+@dataclass(kw_only=True)
+class RawJunction:
+    """Junction."""
+
+    id: str
+    name: str
+    type: str
+    main_road: str | None = None
+    connections: list[RawConnection] = field(default_factory=list)
+    priorities: list[tuple[str, str, int | None]] = field(default_factory=list)  # high, low, line
+    controllers: list[str] = field(default_factory=list)
+    line: int | None = None
+
+
+@dataclass(kw_only=True)
+class RawController:
+    """Signal controller."""
+
+    id: str
+    name: str
+    sequence: int | None
+    signals: tuple[str, ...]
+    line: int | None = None
+
+
+class Parser:
+    """Elements of one file to records."""
+
+    def __init__(self, reader: Reader, report: ImportReport) -> None:
+        self.get, self.report, self.ignored = reader, report, Ignored()
+
+    # --- road -----------------------------------------------------------------------------------
+
+    def road(self, e: Element) -> RawRoad:
+        get, where = self.get, f"road {e.get('id')}"
+        junction = get.text(e, "junction", "-1")
+        rule = get.text(e, "rule", "RHT").upper()
+        if rule not in ("RHT", "LHT"):
+            get.fail(e, f"attribute 'rule' is '{rule}', not RHT or LHT")
+        road = RawRoad(
+            id=get.text(e, "id"),
+            name=get.text(e, "name", ""),
+            length=get.number(e, "length"),
+            junction=None if junction in ("-1", "") else junction,
+            left_hand=rule == "LHT",
+            line=e.sourceline,
+        )
+        if road.length <= 0:
+            get.fail(e, f"attribute 'length' is {road.length:g}: a road needs a length above zero")
+        if road.length > 1e6:
+            get.fail(e, f"attribute 'length' is {road.length:g}: no road is longer than 1000 km")
+        self.report.read("road")
+        for child in e:
+            match child.tag:
+                case "link":
+                    self._road_links(child, road)
+                case "type":
+                    road.types.append(self._road_type(child))
+                    self.report.read("road type")
+                case "planView":
+                    road.reference = self._plan_view(child, road)
+                case "elevationProfile":
+                    road.elevation = self._cubics(child, "elevation", where)
+                case "lateralProfile":
+                    road.superelevation = self._cubics(child, "superelevation", where)
+                case "lanes":
+                    self._lanes(child, road)
+                case "objects":
+                    self._objects(child, road)
+                case "signals":
+                    self._signals(child, road)
+                case _:
+                    self.ignored.add(child, where)
+        road.types.sort(key=lambda t: t[0])
+        if not road.reference.records:
+            get.fail(e, "has no <planView> with a geometry record")
+        if not road.sections:
+            get.fail(e, "has no <lanes> with a <laneSection>")
+        return road
+
+    def _road_links(self, e: Element, road: RawRoad) -> None:
+        get = self.get
+        for child in e:
+            if child.tag not in ("predecessor", "successor"):
+                self.ignored.add(child, f"road {road.id}")
+                continue
+            kind = get.text(child, "elementType", "road")
+            if kind not in ("road", "junction"):
+                get.fail(child, f"attribute 'elementType' is '{kind}', not road or junction")
+            link = RoadLink(
+                is_junction=kind == "junction",
+                id=get.text(child, "elementId"),
+                contact=get.text(child, "contactPoint", ""),
+                s=get.number(child, "elementS") if child.get("elementS") else None,
+                direction=get.text(child, "elementDir", ""),
+                line=child.sourceline,
+            )
+            if link.contact not in ("", "start", "end"):
+                get.fail(child, f"attribute 'contactPoint' is '{link.contact}', not start or end")
+            setattr(road, child.tag, link)
+            self.report.read("road link")
+
+    def _road_type(self, e: Element) -> tuple[float, str, float | None]:
+        speed = None
+        for child in e:
+            if child.tag == "speed":
+                speed = self._speed(child)
+            else:
+                self.ignored.add(child, "road type")
+        return self.get.number(e, "s", 0.0), self.get.text(e, "type", ""), speed
+
+    def _speed(self, e: Element) -> float | None:
+        """m/s; None for 'undefined', infinity for 'no limit'."""
+        raw = self.get.text(e, "max", "")
+        if raw.lower() in ("", "undefined"):
+            return None
+        if raw.lower() in ("no limit", "nolimit", "unlimited"):
+            return float("inf")
+        unit = self.get.text(e, "unit", "")
+        if unit.lower() not in SPEED_UNITS:
+            self.get.fail(e, f"attribute 'unit' is '{unit}', not m/s, km/h or mph")
+        speed = self.get.number(e, "max") * SPEED_UNITS[unit.lower()]
+        if speed <= 0:
+            return None
+        return speed
+
+    def _cubics(self, e: Element, tag: str, where: str, key: str = "s") -> Cubics:
+        records = []
+        for child in e:
+            if child.tag == tag:
+                records.append(self._cubic(child, key))
+                self.report.read(tag)
+            else:
+                self.ignored.add(child, where)
+        return Cubics(records)
+
+    def _cubic(self, e: Element, key: str) -> tuple[float, float, float, float, float]:
+        number = self.get.number
+        return (
+            number(e, key, 0.0),
+            number(e, "a", 0.0),
+            number(e, "b", 0.0),
+            number(e, "c", 0.0),
+            number(e, "d", 0.0),
+        )
+
+    def _plan_view(self, e: Element, road: RawRoad) -> ReferenceLine:
+        get = self.get
+        records: list[Geometry] = []
+        for child in e:
+            if child.tag != "geometry":
+                self.ignored.add(child, f"road {road.id}")
+                continue
+            s, x, y = (get.number(child, k) for k in ("s", "x", "y"))
+            heading, length = get.number(child, "hdg"), get.number(child, "length")
+            shapes = [c for c in child if c.tag != "userData"]
+            for extra in [c for c in child if c.tag == "userData"] + shapes[1:]:
+                self.ignored.add(extra, f"road {road.id}")
+            if not shapes:
+                get.fail(child, "has no shape: one of line, spiral, arc, poly3, paramPoly3 must stand in it")
+            if length <= 0:
+                self.report.repaired(
+                    "geometry",
+                    f"road {road.id} s={s:g}",
+                    f"left out: its length is {length:g}",
+                    child.sourceline,
+                )
+                continue
+            if s < -1e-6 or s > road.length + 1.0:
+                get.fail(
+                    child, f"attribute 's' is {s:g}, outside the road, which is {road.length:g} m long"
+                )
+            records.append(self._geometry(child, shapes[0], s, x, y, heading, length))
+            self.report.read(f"geometry {shapes[0].tag}")
+        return ReferenceLine(records)
+
+    def _geometry(
+        self, e: Element, shape: Element, s: float, x: float, y: float, heading: float, length: float
+    ) -> Geometry:
+        number = self.get.number
+        base = dict(s=s, x=x, y=y, heading=heading, length=length, line=e.sourceline)
+        match shape.tag:
+            case "line":
+                return Geometry(**base, kind=Kind.CLOTHOID)
+            case "arc":
+                curvature = number(shape, "curvature")
+                self._check_turn(shape, curvature * length)
+                return Geometry(**base, kind=Kind.CLOTHOID, curvature=curvature)
+            case "spiral":
+                k0, k1 = number(shape, "curvStart"), number(shape, "curvEnd")
+                self._check_turn(shape, max(abs(k0), abs(k1)) * length)
+                return Geometry(**base, kind=Kind.CLOTHOID, curvature=k0, sharpness=(k1 - k0) / length)
+            case "poly3":
+                a, b, c, d = (number(shape, k, 0.0) for k in "abcd")
+                return Geometry(**base, kind=Kind.PARAMETRIC, u=(0.0, 1.0, 0.0, 0.0), v=(a, b, c, d))
+            case "paramPoly3":
+                p_range = self.get.text(shape, "pRange", "normalized")
+                if p_range not in ("normalized", "arcLength"):
+                    self.get.fail(
+                        shape, f"attribute 'pRange' is '{p_range}', not normalized or arcLength"
+                    )
+                u = tuple(number(shape, f"{k}U", 0.0) for k in "abcd")
+                v = tuple(number(shape, f"{k}V", 0.0) for k in "abcd")
+                p_end = 1.0 if p_range == "normalized" else length
+                if not any(u[1:]) and not any(v[1:]):
+                    self.get.fail(shape, "is a single point: all of bU..dU and bV..dV are zero")
+                return Geometry(**base, kind=Kind.PARAMETRIC, u=u, v=v, p_end=p_end)
+        self.get.fail(shape, "unknown shape: one of line, spiral, arc, poly3, paramPoly3 must stand here")
+
+    def _check_turn(self, e: Element, angle: float) -> None:
+        if abs(angle) > 1000:
+            self.get.fail(e, f"turns by {angle:.3g} rad over its length: curvature is in 1/m")
+
+    # --- lanes ----------------------------------------------------------------------------------
+
+    def _lanes(self, e: Element, road: RawRoad) -> None:
+        offsets = []
+        for child in e:
+            if child.tag == "laneOffset":
+                offsets.append(self._cubic(child, "s"))
+                self.report.read("laneOffset")
+            elif child.tag == "laneSection":
+                road.sections.append(self._section(child, road))
+                self.report.read("laneSection")
+            else:
+                self.ignored.add(child, f"road {road.id}")
+        road.offset = Cubics(offsets)
+        road.sections.sort(key=lambda section: section.s)
+        for section, following in zip(road.sections, road.sections[1:], strict=False):
+            section.end = following.s
+        if road.sections:
+            road.sections[-1].end = road.length
+
+    def _section(self, e: Element, road: RawRoad) -> RawSection:
+        section = RawSection(s=self.get.number(e, "s"), line=e.sourceline)
+        if section.s < -1e-6 or section.s > road.length + 1.0:
+            self.get.fail(
+                e, f"attribute 's' is {section.s:g}, outside the road, which is {road.length:g} m long"
+            )
+        for side in e:
+            if side.tag not in ("left", "center", "right"):
+                self.ignored.add(side, f"road {road.id}")
+                continue
+            for child in side:
+                if child.tag != "lane":
+                    self.ignored.add(child, f"road {road.id}")
+                    continue
+                lane = self._lane(child, road)
+                if lane.id in section.lanes:
+                    self.get.fail(child, f"lane {lane.id} stands twice in this lane section")
+                wrong_side = {"left": lane.id <= 0, "center": lane.id != 0, "right": lane.id >= 0}
+                if wrong_side[side.tag]:
+                    self.get.fail(child, f"lane id {lane.id} cannot stand in <{side.tag}>")
+                section.lanes[lane.id] = lane
+                self.report.read("lane")
+        return section
+
+    def _lane(self, e: Element, road: RawRoad) -> RawLane:
+        get, where = self.get, f"road {road.id} lane {e.get('id')}"
+        lane = RawLane(id=get.integer(e, "id"), type=get.text(e, "type", "none"), line=e.sourceline)
+        direction = get.text(e, "direction", "standard")
+        lane.forward_sign = {"standard": 0, "reversed": 1, "both": 2}.get(direction, 0)
+        widths, borders = [], []
+        for child in e:
+            match child.tag:
+                case "link":
+                    for link in child:
+                        if link.tag == "predecessor":
+                            lane.predecessors += (get.integer(link, "id"),)
+                        elif link.tag == "successor":
+                            lane.successors += (get.integer(link, "id"),)
+                        else:
+                            self.ignored.add(link, where)
+                case "width":
+                    widths.append(self._cubic(child, "sOffset"))
+                case "border":
+                    borders.append(self._cubic(child, "sOffset"))
+                case "roadMark":
+                    lane.marks.append(self._mark(child, where))
+                case "speed":
+                    speed = self._speed(child)
+                    if speed is not None:
+                        lane.speeds.append((get.number(child, "sOffset", 0.0), speed))
+                case "access":
+                    who = tuple(r.get("type", "") for r in child if r.tag == "restriction")
+                    who += (child.get("restriction"),) if child.get("restriction") else ()
+                    lane.access.append((get.number(child, "sOffset", 0.0), get.text(child, "rule", ""), who))
+                case _:
+                    self.ignored.add(child, where)
+        if widths:
+            lane.width = Cubics(widths)
+            self.report.read("lane width", len(widths))
+            if min(w[0] for w in widths) > 1e-6:
+                self.report.repaired(
+                    "lane width", where, "the first record starts late: extended backwards", lane.line
+                )
+            if borders:
+                self.report.ignored(
+                    "lane border",
+                    where,
+                    "the lane has width records too, and these prevail",
+                    lane.line,
+                    count=len(borders),
+                )
+        elif borders:
+            lane.border = Cubics(borders)
+            self.report.read("lane border", len(borders))
+        elif lane.id != 0:
+            self.report.repaired(
+                "lane", where, "has neither width nor border records: width 0 assumed", lane.line
+            )
+        lane.marks.sort(key=lambda mark: mark.s)
+        lane.speeds.sort()
+        lane.access.sort()
+        for element, found in (
+            ("roadMark", lane.marks),
+            ("lane speed", lane.speeds),
+            ("lane access", lane.access),
+        ):
+            self.report.read(element, len(found))
+        return lane
+
+    def _mark(self, e: Element, where: str) -> Mark:
+        rules: list[str] = []
+        for child in e:
+            if child.tag in ("type", "explicit"):
+                rules += [line.get("rule", "") for line in child if line.tag == "line"]
+            elif child.tag != "sway":
+                self.ignored.add(child, where)
+        return Mark(
+            s=self.get.number(e, "sOffset", 0.0),
+            type=self.get.text(e, "type", "none").lower(),
+            change=e.get("laneChange"),
+            rules=tuple(rules),
+        )
+
+    # --- things on the road ---------------------------------------------------------------------
+
+    def _validity(self, e: Element) -> list[tuple[int, int]]:
+        return [
+            (self.get.integer(v, "fromLane"), self.get.integer(v, "toLane"))
+            for v in e
+            if v.tag == "validity"
+        ]
+
+    def _signals(self, e: Element, road: RawRoad) -> None:
+        get = self.get
+        for child in e:
+            if child.tag not in ("signal", "signalReference"):
+                self.ignored.add(child, f"road {road.id}")
+                continue
+            reference = child.tag == "signalReference"
+            value = child.get("value")
+            signal = RawSignal(
+                id=get.text(child, "id"),
+                s=get.number(child, "s"),
+                t=get.number(child, "t", 0.0),
+                z=get.number(child, "zOffset", 0.0),
+                orientation=get.text(child, "orientation", "none"),
+                validity=self._validity(child),
+                reference=reference,
+                name=get.text(child, "name", ""),
+                type=get.text(child, "type", ""),
+                subtype=get.text(child, "subtype", ""),
+                country=get.text(child, "country", "").upper(),
+                dynamic=get.text(child, "dynamic", "no").lower() in ("yes", "true"),
+                value=get.number(child, "value") if value is not None and value.strip() else None,
+                unit=get.text(child, "unit", ""),
+                heading_offset=get.number(child, "hOffset", 0.0),
+                line=child.sourceline,
+            )
+            road.signals.append(signal)
+            self.report.read("signalReference" if reference else "signal")
+            for inner in child:
+                if inner.tag != "validity":
+                    self.ignored.add(inner, f"road {road.id} signal {signal.id}")
+
+    def _objects(self, e: Element, road: RawRoad) -> None:
+        get = self.get
+        for child in e:
+            if child.tag != "object":
+                self.ignored.add(child, f"road {road.id}")
+                continue
+            raw = RawObject(
+                id=get.text(child, "id", ""),
+                type=get.text(child, "type", "").lower(),
+                subtype=get.text(child, "subtype", "").lower(),
+                name=get.text(child, "name", ""),
+                s=get.number(child, "s", 0.0),
+                t=get.number(child, "t", 0.0),
+                z=get.number(child, "zOffset", 0.0),
+                heading=get.number(child, "hdg", 0.0),
+                length=get.number(child, "length", 0.0),
+                width=get.number(child, "width", 0.0),
+                height=get.number(child, "height", 0.0),
+                outlines=[self._outline(o, road) for o in child.iter("outline")],
+                validity=self._validity(child),
+                line=child.sourceline,
+            )
+            raw.outlines = [outline for outline in raw.outlines if len(outline) >= 2]
+            road.objects.append(raw)
+            for inner in child:
+                if inner.tag not in ("outline", "outlines", "validity"):
+                    self.ignored.add(inner, f"road {road.id} object {raw.id}")
+
+    def _outline(self, e: Element, road: RawRoad) -> list[tuple[bool, float, float]]:
+        corners = []
+        for child in e:
+            if child.tag == "cornerRoad":
+                corners.append((True, self.get.number(child, "s"), self.get.number(child, "t")))
+            elif child.tag == "cornerLocal":
+                corners.append((False, self.get.number(child, "u"), self.get.number(child, "v")))
+            else:
+                self.ignored.add(child, f"road {road.id}")
+        return corners
+
+    # --- junctions and controllers --------------------------------------------------------------
+
+    def junction(self, e: Element) -> RawJunction:
+        get = self.get
+        junction = RawJunction(
+            id=get.text(e, "id"),
+            name=get.text(e, "name", ""),
+            type=get.text(e, "type", "default"),
+            main_road=e.get("mainRoad"),
+            line=e.sourceline,
+        )
+        where = f"junction {junction.id}"
+        self.report.read("junction")
+        for child in e:
+            match child.tag:
+                case "connection":
+                    self._connection(child, junction)
+                case "priority":
+                    junction.priorities.append(
+                        (get.text(child, "high"), get.text(child, "low"), child.sourceline)
+                    )
+                case "controller":
+                    junction.controllers.append(get.text(child, "id"))
+                    self.report.read("junction controller")
+                case _:
+                    self.ignored.add(child, where)
+        return junction
+
+    def _connection(self, e: Element, junction: RawJunction) -> None:
+        get = self.get
+        road = e.get("connectingRoad") or e.get("linkedRoad")
+        if road is None:
+            get.fail(e, "names neither a connectingRoad nor a linkedRoad")
+        contact = get.text(e, "contactPoint", "start")
+        if contact not in ("start", "end"):
+            get.fail(e, f"attribute 'contactPoint' is '{contact}', not start or end")
+        links = []
+        for child in e:
+            if child.tag == "laneLink":
+                links.append((get.integer(child, "from"), get.integer(child, "to")))
+            elif child.tag not in ("predecessor", "successor"):  # virtual junctions: roads say the same
+                self.ignored.add(child, f"junction {junction.id}")
+        junction.connections.append(
+            RawConnection(
+                incoming=e.get("incomingRoad"),
+                road=road.strip(),
+                contact=contact,
+                lanes=tuple(links),
+                line=e.sourceline,
+            )
+        )
+        self.report.read("connection")
+        self.report.read("laneLink", len(links))
+
+    def controller(self, e: Element) -> RawController:
+        signals = []
+        for child in e:
+            if child.tag == "control":
+                signals.append(self.get.text(child, "signalId"))
+            else:
+                self.ignored.add(child, f"controller {e.get('id')}")
+        self.report.read("controller")
+        sequence = e.get("sequence")
+        return RawController(
+            id=self.get.text(e, "id"),
+            name=self.get.text(e, "name", ""),
+            sequence=self.get.integer(e, "sequence") if sequence and sequence.strip() else None,
+            signals=tuple(dict.fromkeys(signals)),
+            line=e.sourceline,
+        )
