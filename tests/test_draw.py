@@ -1,7 +1,9 @@
 """Drawings: what is on the axes agrees with the network, and files are what their suffix says."""
 
-import builtins
+import itertools
 import math
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
@@ -9,7 +11,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("matplotlib")
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex, to_rgba
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 
 from limsim_jax.maps import draw
 from limsim_jax.maps.draw import TRAFFIC_ZORDER, draw_map, draw_network
@@ -170,3 +175,278 @@ def crossing() -> Network:
             ),
         ),
     )
+
+
+def _axes():
+    return Figure(figsize=(8, 8)).add_axes((0, 0, 1, 1))
+
+
+def _polygons(artists) -> list[np.ndarray]:
+    return [path.vertices[:-1] for artist in artists for path in artist.get_paths()]
+
+
+def _area(polygon: np.ndarray) -> float:
+    x, y = polygon.T
+    return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+
+
+def test_every_lane_is_drawn_with_its_surface(crossing):
+    surfaces = draw_network(_axes(), crossing)["surfaces"]
+    polygons = _polygons(surfaces)
+    assert len(polygons) == len(crossing.lanes)
+    drawn = sorted(_area(p) for p in polygons)
+    # A band of constant width around an arc or a line has the area length times width.
+    exact = sorted(lane.length * lane.width[0] for lane in crossing.lanes.values())
+    np.testing.assert_allclose(drawn, exact, rtol=2e-3)
+
+
+def test_arrows_point_along_the_lane_they_stand_on(crossing):
+    arrows = _polygons(draw_network(_axes(), crossing)["arrows"])
+    seen = set()
+    for arrow in arrows:
+        tail = arrow[len(arrow) // 2] if len(arrow) == 4 else 0.5 * (arrow[3] + arrow[4])
+        direction = arrow[0] - tail
+        middle = 0.5 * (arrow[0] + tail)
+        distance, lane, s = min(
+            (float(np.hypot(*(lane.pose(s)[0][:2] - middle))), lane.id, s)
+            for lane in crossing.drivable_lanes()
+            if lane.junction is None
+            for s in np.linspace(0, lane.length, 481)
+        )
+        assert distance < 0.1
+        heading = float(crossing.lanes[lane].pose(s)[1])
+        assert direction @ [math.cos(heading), math.sin(heading)] > 0.9999 * np.hypot(*direction)
+        seen.add(lane)
+    assert seen == {lane.id for lane in crossing.drivable_lanes() if lane.junction is None}
+
+
+@pytest.mark.parametrize(
+    ("arm", "painted"),
+    [
+        ("W", [(3.5, 1.0)]),  # nobody may cross
+        ("N", [(3.5, 0.5)]),  # both may
+        ("E", [(3.5 - 0.12, 1.0), (3.5 + 0.12, 0.5)]),  # only from the outer lane: dashed on its side
+    ],
+)
+def test_marks_between_lanes_follow_the_permissions(crossing, arm, painted):
+    ax = _axes()
+    layers = draw_network(ax, crossing, bounds=(-20, -20, 20, 20))
+    white = [a for a in layers["marks"] if np.allclose(a.get_colors()[0][:3], 1.0)]
+    along = {"E": np.array([1.0, 0.0]), "N": np.array([0.0, 1.0]), "W": np.array([-1.0, 0.0])}[arm]
+    side = np.array([-along[1], along[0]])
+    length: dict[float, float] = {}
+    for artist in white:
+        for p, q in (pair for line in artist.get_segments() for pair in itertools.pairwise(line)):
+            if p @ along > BOX - 1e-6 and q @ along > BOX - 1e-6 and abs((q - p) @ side) < 1e-9:
+                offset = round(float(p @ side), 2)
+                length[offset] = length.get(offset, 0.0) + abs(float((q - p) @ along))
+    assert sorted(length) == [d for d, _ in painted]
+    for d, share in painted:
+        assert length[d] / (REACH - BOX) == pytest.approx(share, abs=0.07)
+
+
+def test_opposite_directions_are_parted_by_one_centre_line(crossing):
+    marks = draw_network(_axes(), crossing)["marks"]
+    centre = [a for a in marks if np.allclose(a.get_colors()[0], to_rgba(draw.CENTRE))]
+    assert sum(len(a.get_segments()) for a in centre) == 4
+
+
+def test_connectors_have_the_colour_of_their_turn(crossing):
+    artists = draw_network(_axes(), crossing)["connectors"]
+    lines = [a for a in artists if isinstance(a, LineCollection)]
+    counts = {to_hex(a.get_colors()[0]): len(a.get_segments()) for a in lines}
+    assert counts == {"#0072b2": 4, "#d55e00": 4, "#007a57": 4}
+
+
+def test_a_connector_that_no_movement_uses_stands_out(crossing):
+    artists = draw_network(_axes(), replace(crossing, movements=crossing.movements[1:]))["connectors"]
+    black = [a for a in artists if isinstance(a, LineCollection) and to_hex(a.get_colors()[0]) == "#000000"]
+    assert [len(a.get_segments()) for a in black] == [1]
+
+
+def test_stop_bars_lie_across_their_lanes(crossing):
+    layers = draw_network(_axes(), crossing)
+    bars = [bar for artist in layers["stop_lines"] for bar in artist.get_segments()]
+    line = next(bar for bar in bars if np.allclose(bar.mean(0), [-13.0, -1.75]))
+    np.testing.assert_allclose(sorted(line[:, 1]), [-3.5, 0.0], atol=1e-9)
+    # Lanes with signals but neither head nor line in the file are barred at their end: 8 - 2 - 1.
+    ends = [bar for bar in bars if np.isclose(np.abs(bar.mean(0)).max(), BOX)]
+    assert len(ends) == 5
+
+
+def test_a_light_is_linked_to_every_lane_it_governs(crossing):
+    lights = draw_network(_axes(), crossing)["lights"]
+    starts = [seg for a in lights if isinstance(a, LineCollection) for seg in a.get_segments()]
+    links = [seg for seg in starts if np.allclose(seg[0], [14.0, 9.0]) and np.hypot(*(seg[1] - seg[0])) > 3]
+    np.testing.assert_allclose(sorted(seg[1][1] for seg in links), [1.75, 5.25], atol=1e-9)
+    tick = next(seg for seg in starts if np.allclose(seg[0], [14.0, 9.0]) and abs(seg[1][1] - 9.0) < 1e-9)
+    assert tick[1][0] < 14.0  # traffic that looks at it drives west
+
+
+def test_crosswalk_bars_fill_half_of_the_outline_along_the_traffic(crossing):
+    layer = draw_network(_axes(), crossing)["crosswalks"]
+    outline, bars = _polygons(layer[:1])[0], _polygons(layer[1:])
+    assert sum(map(_area, bars)) == pytest.approx(0.5 * _area(outline), rel=0.1)
+    for bar in bars:
+        assert np.ptp(bar[:, 0]) == pytest.approx(4.0)  # as long as the walk is deep
+        assert np.ptp(bar[:, 1]) < 1.5
+
+
+def test_speed_signs_show_their_number(crossing):
+    ax = _axes()
+    draw_network(ax, crossing, bounds=(20, -10, 60, 20))
+    assert "50" in [text.get_text() for text in ax.texts]
+
+
+def test_labels_name_roads_and_junctions(crossing):
+    ax = _axes()
+    draw_network(ax, crossing, labels=True)
+    assert {"J", "E", "N", "W", "S"} <= {text.get_text() for text in ax.texts}
+
+
+def test_traffic_lies_above_the_base_layer(crossing):
+    layers = draw_network(_axes(), crossing, labels=True)
+    assert max(artist.get_zorder() for layer in layers.values() for artist in layer) < TRAFFIC_ZORDER
+
+
+def test_only_lanes_within_the_bounds_are_drawn(crossing):
+    surfaces = draw_network(_axes(), crossing, bounds=(30, -10, 70, 10))["surfaces"]
+    assert len(_polygons(surfaces)) == 4  # the east arm
+
+
+def test_a_bridge_hides_the_road_below(crossing):
+    below = _line("low_1", (-50.0, 0.0), (50.0, 0.0))
+    above = _line("high_1", (0.0, -50.0), (0.0, 50.0))
+    above = replace(above, xyz=above.xyz + np.array([0.0, 0.0, 6.0]))
+    network = replace(
+        crossing,
+        lanes={"high_1": above, "low_1": below},
+        roads={},
+        movements=(),
+        junctions={},
+        traffic_lights=(),
+        signs=(),
+        stop_lines=(),
+        crosswalks=(),
+    )
+    layers = draw_network(_axes(), network)
+    top = max(layers["surfaces"], key=lambda a: a.get_zorder())
+    low, high = _polygons([top])[0].min(0), _polygons([top])[0].max(0)
+    assert high[1] - low[1] > 99
+    lower_marks = [a for a in layers["marks"] if any(np.ptp(s[:, 0]) > 99 for s in a.get_segments())]
+    assert lower_marks
+    assert all(a.get_zorder() < top.get_zorder() for a in lower_marks)
+
+
+def test_a_long_thin_map_is_cut_into_strips_of_one_scale(crossing):
+    lane = _line("road_1", (0.0, 0.0), (10_000.0, 0.0))
+    network = replace(
+        crossing, lanes={"road_1": lane}, roads={}, movements=(), junctions={}, traffic_lights=(), signs=()
+    )
+    network = replace(network, stop_lines=(), crosswalks=())
+    figure = draw_map(network)
+    assert len(figure.axes) > 3
+    scales = []
+    for ax in figure.axes:
+        (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
+        box = ax.get_window_extent()
+        assert box.width / (x1 - x0) == pytest.approx(box.height / (y1 - y0), rel=1e-6)
+        scales.append(box.width / (x1 - x0))
+    np.testing.assert_allclose(scales, scales[0])
+    # Every strip begins where the one above it ended.
+    for ax, following in itertools.pairwise(figure.axes):
+        assert following.get_xlim()[0] == pytest.approx(ax.get_xlim()[1])
+    assert figure.axes[0].get_xlim()[0] <= 0.0
+    assert figure.axes[-1].get_xlim()[1] >= 10_000.0
+    assert 3.5 * scales[0] > 3.0  # px: a lane can be seen
+
+
+@pytest.mark.parametrize("size", [None, (6.0, 9.0), (12.0, 4.0)])
+def test_axes_have_one_scale_for_x_and_y(crossing, size):
+    figure = draw_map(crossing, size=size)
+    (ax,) = figure.axes
+    (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
+    box = ax.get_window_extent()
+    assert box.width / (x1 - x0) == pytest.approx(box.height / (y1 - y0), rel=1e-6)
+    if size:
+        assert tuple(figure.get_size_inches()) == size
+
+
+def test_the_page_says_what_the_map_has(crossing):
+    crossing.report.counts.clear()
+    crossing.report.read("lane", 28)
+    figure = draw_map(crossing)
+    text = "\n".join(t.get_text() for t in figure.texts)
+    km = sum(lane.length for lane in crossing.drivable_lanes()) / 1000
+    for part in ("crossing", "OpenDRIVE 1.7", "28 lanes", f"{km:.2f} km", "1 junction ", "1 traffic light"):
+        assert part in text
+    assert "28 read, 0 approximated, 0 ignored, 0 repaired" in text
+    legend = {t.get_text() for t in figure.legends[0].get_texts()}
+    assert {"driving lane", "sidewalk", "left", "traffic light", "stop line", "crosswalk"} <= legend
+    assert not legend & {"parking", "u-turn", "tram, rail", "conflict: cross"}
+
+
+def test_png_shows_the_lanes_where_they_are(crossing, tmp_path):
+    figure = draw_map(crossing, tmp_path / "map.png", dpi=80)
+    pixels = imread(tmp_path / "map.png")[..., :3]
+    (ax,) = figure.axes
+    box = ax.get_position()
+    (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
+
+    def pixel(x: float, y: float) -> np.ndarray:
+        u = box.x0 + (x - x0) / (x1 - x0) * box.width
+        v = box.y0 + (y - y0) / (y1 - y0) * box.height
+        return pixels[int((1 - v) * pixels.shape[0]), int(u * pixels.shape[1])]
+
+    np.testing.assert_allclose(pixel(55.0, 2.6), to_rgba("#b3bac4")[:3], atol=0.01)  # a driving lane
+    np.testing.assert_allclose(pixel(50.0, -4.6), to_rgba("#ebe3d3")[:3], atol=0.01)  # the sidewalk
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 50
+
+
+def test_svg_is_xml_with_a_path_per_lane_and_the_same_every_time(crossing, tmp_path):
+    draw_map(crossing, tmp_path / "a.svg")
+    draw_map(crossing, tmp_path / "b.svg")
+    root = ET.parse(tmp_path / "a.svg").getroot()
+    assert root.tag == "{http://www.w3.org/2000/svg}svg"
+    (group,) = [g for g in root.iter() if g.get("id") == "surfaces-0"]
+    drawn = [e for e in group.iter() if e.tag.endswith(("}use", "}path"))]
+    clip_or_use = [e for e in drawn if e.tag.endswith("}use")] or drawn
+    assert len(clip_or_use) == len(crossing.lanes)
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+
+
+def test_pdf_is_written(crossing, tmp_path):
+    draw_map(crossing, tmp_path / "map.pdf")
+    assert (tmp_path / "map.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize("name", ["map.bmp", "map", "nowhere/map.png"])
+def test_a_target_that_cannot_be_written_is_one_clear_line(crossing, tmp_path, name):
+    with pytest.raises(MapError) as error:
+        draw_map(crossing, tmp_path / name)
+    assert "\n" not in str(error.value)
+    assert ("nowhere" if "/" in name else ".png, .svg, .pdf") in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("bounds", [(10, 0, -10, 5), (0, 0, 0, 5), (math.nan, 0, 1, 1), (900, 900, 950, 950)])
+def test_useless_bounds_are_refused(crossing, bounds):
+    with pytest.raises(MapError, match="bounds"):
+        draw_map(crossing, bounds=bounds)
+
+
+def test_a_map_without_lanes_is_refused(crossing):
+    with pytest.raises(MapError, match="no lanes"):
+        draw_map(replace(crossing, lanes={}))
+
+
+def test_without_matplotlib_the_error_says_what_to_install(crossing, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'limsim-jax\[viz\]'") as error:
+        draw_map(crossing)
+    assert "\n" not in str(error.value)
+
+
+def test_the_module_loads_without_matplotlib():
+    code = "import sys, limsim_jax.maps.draw; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

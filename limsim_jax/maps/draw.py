@@ -217,7 +217,7 @@ class _Painter:
         """A size in metres as points, held between two sizes that the eye can use (points)."""
         return min(max(metres * self.ppm, least), most)
 
-    def lines(self, layer: str, segments: Sequence[Any], zorder: float, **style: Any) -> None:
+    def lines(self, layer: str, segments: Sequence[Any] | Array, zorder: float, **style: Any) -> None:
         from matplotlib.collections import LineCollection
 
         if len(segments):
@@ -226,7 +226,7 @@ class _Painter:
             self.ax.add_collection(collection, autolim=False)
             self.keep(layer, collection, zorder)
 
-    def areas(self, layer: str, polygons: Sequence[Any], zorder: float, **style: Any) -> None:
+    def areas(self, layer: str, polygons: Sequence[Any] | Array, zorder: float, **style: Any) -> None:
         from matplotlib.collections import PolyCollection
 
         if len(polygons):
@@ -240,7 +240,7 @@ class _Painter:
             groups.setdefault(self.levels[shape.lane.id], []).append(shape)
         yield from sorted(groups.items())
 
-    def visible(self, position: Sequence[float]) -> bool:
+    def visible(self, position: Any) -> bool:
         x0, y0, x1, y1 = self.bounds
         return x0 <= position[0] <= x1 and y0 <= position[1] <= y1
 
@@ -591,7 +591,7 @@ class _Painter:
         size = 6.0
         placed: list[Bounds] = []
 
-        def room(xy: Sequence[float], text: str) -> bool:
+        def room(xy: Any, text: str) -> bool:
             half_x, half_y = 0.32 * size * len(text) / self.ppm, 0.6 * size / self.ppm
             box = (xy[0] - half_x, xy[1] - half_y, xy[0] + half_x, xy[1] + half_y)
             if any(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in placed):
@@ -764,7 +764,9 @@ def _strips(view: Bounds, room: tuple[float, float]) -> tuple[list[Bounds], bool
         return min(along / (long / count), max(0.0, across - (count - 1) * _GAP) / (count * short))
 
     count = 1
-    while scale(count) < _CLEAR and scale(count + 1) > 1.05 * scale(count):
+    while (
+        scale(count) < _CLEAR and long > 1.5 * short * (count + 1) and scale(count + 1) > 1.05 * scale(count)
+    ):
         count += 1
     cuts = np.linspace(x0 if wide else y0, x1 if wide else y1, count + 1)
     pairs = list(zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True))
