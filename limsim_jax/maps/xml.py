@@ -150,8 +150,6 @@ class Reader:
             self.fail(element, f"attribute '{name}' is '{value[:40]}', not a number")
         if not math.isfinite(number):
             self.fail(element, f"attribute '{name}' is '{value}', not a finite number")
-        if abs(number) > 1e12:
-            self.fail(element, f"attribute '{name}' is {number:g}: no map is that large")
         return number
 
     def integer(self, element: Element, name: str) -> int:

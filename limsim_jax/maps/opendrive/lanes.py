@@ -1,0 +1,641 @@
+"""Lanes of an OpenDRIVE road: from polynomials over the road's `s` to sampled centre lines.
+
+A road is cut into pieces on which nothing changes but the geometry: at every lane section, speed,
+access or lane-change permission that really differs. Sections that only continue each other are
+joined, so that traffic does not meet lanes of a few centimetres.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limsim_jax.maps.network import DRIVABLE, MOTOR_CLASSES, ImportReport, Lane, LaneType
+from limsim_jax.maps.opendrive.curves import Array, Cubics
+from limsim_jax.maps.opendrive.records import Mark, RawLane, RawRoad, RawSection
+
+MIN_SECTION = 1e-3  # m; a lane section shorter than this holds no traffic
+MIN_WIDTH = 0.05  # m; a lane that nowhere gets wider does not exist for its neighbours
+JUMP = 0.01  # m; where lane edges jump by more, the lane is cut
+_HERMITE = 1e-5  # m, tolerated error of cubic Hermite interpolation between samples
+_X, _W = np.polynomial.legendre.leggauss(4)
+_X, _W = (_X + 1) / 2, _W / 2
+
+DEFAULT_SPEED = {  # m/s where the file gives none, by road type
+    "motorway": 130 / 3.6,
+    "rural": 100 / 3.6,
+    "townExpressway": 70 / 3.6,
+    "lowSpeed": 30 / 3.6,
+    "townPrivate": 30 / 3.6,
+    "townLocal": 30 / 3.6,
+    "townPlayStreet": 10 / 3.6,
+    "bicycle": 25 / 3.6,
+    "pedestrian": 5 / 3.6,
+}
+URBAN_SPEED = 50 / 3.6
+NO_LIMIT_SPEED = 130 / 3.6
+
+_TYPES = {t.value.lower(): t for t in LaneType} | {
+    "mwyentry": LaneType.ENTRY,
+    "mwyexit": LaneType.EXIT,
+    "special1": LaneType.SPECIAL,
+    "special2": LaneType.SPECIAL,
+    "special3": LaneType.SPECIAL,
+    "roadworks": LaneType.ROAD_WORKS,
+}
+_ACCESS = {
+    LaneType.BUS: frozenset({"bus", "emergency"}),
+    LaneType.TAXI: frozenset({"taxi", "emergency"}),
+    LaneType.HOV: MOTOR_CLASSES - {"truck"},
+    LaneType.BIKING: frozenset({"bicycle"}),
+    LaneType.SIDEWALK: frozenset({"pedestrian"}),
+    LaneType.WALKING: frozenset({"pedestrian"}),
+    LaneType.BIDIRECTIONAL: MOTOR_CLASSES,
+    LaneType.TRAM: frozenset({"tram"}),
+    LaneType.RAIL: frozenset({"rail"}),
+}
+_RESTRICTIONS = {
+    "passengercar": "car",
+    "delivery": "van",
+    "truck": "truck",
+    "trucks": "truck",
+    "bus": "bus",
+    "emergency": "emergency",
+    "motorcycle": "motorcycle",
+    "taxi": "taxi",
+    "bicycle": "bicycle",
+    "pedestrian": "pedestrian",
+}
+
+LaneKey = tuple[str, int, int]  # road id, piece index, lane number
+
+
+def lane_id(key: LaneKey) -> str:
+    """The id of a lane in the network."""
+    road, piece, number = key
+    return f"{road}_{piece}_{number}"
+
+
+@dataclass(frozen=True)
+class Attributes:
+    """What is constant along a lane of a piece."""
+
+    type: LaneType
+    forward: bool  # traffic runs towards larger s
+    speed: float
+    access: frozenset[str]
+    change_up: bool  # may cross to the next lane at larger t, from this lane
+    change_down: bool
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A stretch of road that becomes one lane per lane number."""
+
+    index: int
+    start: float
+    end: float
+    parts: tuple[tuple[RawSection, float, float], ...]  # sections, and the stretch taken of each
+    attributes: dict[int, Attributes]
+
+
+class RoadShape:
+    """Positions on one road."""
+
+    def __init__(self, road: RawRoad) -> None:
+        self.road = road
+
+    def point(self, s: float, t: float) -> tuple[float, float, float, float]:
+        """`x, y, z, heading` of the road at one `s`, `t` away from the reference line."""
+        s_ = np.array([min(max(s, 0.0), self.road.length)])
+        x, y, heading, _, _ = self.road.reference.frame(s_, s_)
+        z = self.road.elevation(s_, s_)
+        return (
+            float(x[0] - t * np.sin(heading[0])),
+            float(y[0] + t * np.cos(heading[0])),
+            float(z[0]),
+            float(heading[0]),
+        )
+
+    def profile(self, section: RawSection, s: Array, at: Array) -> dict[int, tuple[Array, Array]]:
+        """Per lane number: centre offset t with its first two derivatives `[3, M]`, and width `[M]`."""
+        offset = np.stack([self.road.offset(s, at, k) for k in range(3)])
+        result: dict[int, tuple[Array, Array]] = {}
+        local, local_at = s - section.s, at - section.s
+        for side in (1, -1):
+            inner = offset
+            for number in sorted((n for n in section.lanes if n * side > 0), key=abs):
+                lane = section.lanes[number]
+                width = _width(lane, side, inner - offset, local, local_at)
+                outer = inner + side * width
+                result[number] = ((inner + outer) / 2, width[0])
+                inner = outer
+        return result
+
+    def knots(self, section: RawSection, start: float, end: float) -> Array:
+        """Where a record of any kind begins inside `(start, end)`."""
+        cubics: list[tuple[float, Cubics | None]] = [
+            (0.0, self.road.offset),
+            (0.0, self.road.elevation),
+        ]
+        for lane in section.lanes.values():
+            cubics += [(section.s, lane.width), (section.s, lane.border)]
+        found = [self.road.reference.s] + [s0 + c.s for s0, c in cubics if c is not None]
+        knots = np.unique(np.concatenate(found))
+        return knots[(knots > start + 1e-6) & (knots < end - 1e-6)]
+
+
+def _width(lane: RawLane, side: int, inner: Array, s: Array, at: Array) -> Array:
+    """Width and its first two derivatives `[3, M]`; never below zero. `inner` is relative to lane 0."""
+    if lane.width is not None:
+        width = np.stack([lane.width(s, at, k) for k in range(3)])
+    elif lane.border is not None:
+        width = side * (np.stack([lane.border(s, at, k) for k in range(3)]) - inner)
+    else:
+        width = np.zeros((3, len(s)))
+    return np.where(width[0] > 0, width, 0.0)
+
+
+# --- pieces -------------------------------------------------------------------------------------
+
+
+class Cutter:
+    """Cuts roads into pieces and reports what it had to decide."""
+
+    def __init__(self, report: ImportReport) -> None:
+        self.report = report
+        self.piece_at: dict[tuple[str, int], list[Piece]] = {}  # (road, section index) -> pieces, ascending
+
+    def pieces(self, road: RawRoad, extra: set[float]) -> list[Piece]:
+        """The pieces of a road, ascending in s. `extra` are places where it has to be cut."""
+        shape = RoadShape(road)
+        atoms: list[tuple[int, RawSection, float, float, bool]] = []
+        for k, section in enumerate(road.sections):
+            start, end = max(section.s, 0.0), min(section.end, road.length)
+            if end - start < MIN_SECTION:
+                self.report.repaired(
+                    "laneSection",
+                    f"road {road.id} s={section.s:g}",
+                    f"is {max(end - start, 0.0):g} m long: left out, its links pass through",
+                    section.line,
+                )
+                continue
+            changes = {section.s + r for lane in section.lanes.values() for r in _changes(lane)}
+            changes |= {s for s, _, _ in road.types}
+            jumps = self._jumps(shape, section, start, end)
+            cuts = sorted(
+                {s for s in changes | jumps | extra if start + MIN_SECTION < s < end - MIN_SECTION}
+            )
+            edges = [start, *cuts, end]
+            for a, b in itertools.pairwise(edges):
+                atoms.append((k, section, a, b, a in jumps or _near(a, extra)))
+
+        pieces: list[Piece] = []
+        current: list[tuple[int, RawSection, float, float]] = []
+        current_attributes: dict[int, Attributes] = {}
+
+        def close() -> None:
+            if current:
+                piece = Piece(
+                    len(pieces),
+                    current[0][2],
+                    current[-1][3],
+                    tuple((section, a, b) for _, section, a, b in current),
+                    current_attributes,
+                )
+                pieces.append(piece)
+                for k in dict.fromkeys(k for k, *_ in current):
+                    self.piece_at.setdefault((road.id, k), []).append(piece)
+
+        for k, section, a, b, forced in atoms:
+            attributes = self._attributes(road, shape, section, (a + b) / 2)
+            joined = (
+                bool(current)
+                and not forced
+                and attributes == current_attributes
+                and self._continues(road, shape, current[-1], (k, section, a, b))
+            )
+            if not joined:
+                close()
+                current, current_attributes = [], attributes
+            elif k != current[-1][0]:
+                self.report.read("laneSection joined to the one before")
+            current.append((k, section, a, b))
+        close()
+        return pieces
+
+    def _jumps(self, shape: RoadShape, section: RawSection, start: float, end: float) -> set[float]:
+        """Knots inside a section where some lane centre jumps sideways by more than `JUMP`."""
+        knots = shape.knots(section, start, end)
+        if not knots.size:
+            return set()
+        edges = np.concatenate([[start], knots, [end]])
+        middle = (edges[:-1] + edges[1:]) / 2
+        before = shape.profile(section, knots, middle[:-1])
+        after = shape.profile(section, knots, middle[1:])
+        jump = np.max([np.abs(before[n][0][0] - after[n][0][0]) for n in before] or [np.zeros(len(knots))], 0)
+        reference = shape.road.reference
+        x0, y0, *_ = reference.frame(knots, middle[:-1])
+        x1, y1, *_ = reference.frame(knots, middle[1:])
+        gap = np.hypot(x1 - x0, y1 - y0)
+        for s, lateral, along in zip(knots, jump, gap, strict=True):
+            if lateral > JUMP or along > JUMP:
+                self.report.approximated(
+                    "lane geometry" if lateral > JUMP else "geometry",
+                    f"road {shape.road.id} s={s:.3f}",
+                    f"jumps by {max(lateral, along):.3f} m between two records: lanes are cut there",
+                    section.line,
+                )
+        return {float(s) for s in knots[(jump > JUMP) | (gap > JUMP)]}
+
+    def _continues(
+        self,
+        road: RawRoad,
+        shape: RoadShape,
+        before: tuple[int, RawSection, float, float],
+        after: tuple[int, RawSection, float, float],
+    ) -> bool:
+        """Whether two stretches with equal attributes are one: same lanes, linked, without a jump."""
+        (k0, section0, _, _), (k1, section1, s, _) = before, after
+        if k0 == k1:
+            return True
+        if k1 != k0 + 1:  # a degenerate section between them: its links decide, keep them apart
+            return False
+        for number, lane in section0.lanes.items():
+            if number == 0:
+                continue
+            linked = number in lane.successors or number in section1.lanes[number].predecessors
+            extra = set(lane.successors) | set(section1.lanes[number].predecessors)
+            others = {
+                n
+                for n, other in section1.lanes.items()
+                if n != number and number in other.predecessors
+            } | {n for n, other in section0.lanes.items() if n != number and number in other.successors}
+            if not linked or extra - {number} or others:
+                return False
+        at = np.array([s])
+        left = shape.profile(section0, at, at - 1e-6)
+        right = shape.profile(section1, at, at + 1e-6)
+        return all(abs(left[n][0][0, 0] - right[n][0][0, 0]) < JUMP for n in left)
+
+    def _attributes(
+        self, road: RawRoad, shape: RoadShape, section: RawSection, s: float
+    ) -> dict[int, Attributes]:
+        numbers = sorted(n for n in section.lanes if n != 0)
+        types = {n: self._type(road, section.lanes[n]) for n in numbers}
+        forward = {n: _forward(road, section.lanes[n]) for n in numbers}
+        at = np.array([s])
+        profile = shape.profile(section, at, at)
+        real = [n for n in numbers if profile[n][1][0] >= MIN_WIDTH or _ever_wide(shape, section, n)]
+        result = {}
+        for n in numbers:
+            up = down = False
+            if n in real:
+                i = real.index(n)
+                if i + 1 < len(real) and _may_mix(types, forward, n, real[i + 1]):
+                    up = _permission(section, n, real[i + 1], s - section.s)[0]
+                if i > 0 and _may_mix(types, forward, n, real[i - 1]):
+                    down = _permission(section, real[i - 1], n, s - section.s)[1]
+            result[n] = Attributes(
+                type=types[n],
+                forward=forward[n],
+                speed=self._speed(road, section.lanes[n], section, s),
+                access=self._access(road, section.lanes[n], types[n], s - section.s),
+                change_up=up,
+                change_down=down,
+            )
+        return result
+
+    def _type(self, road: RawRoad, lane: RawLane) -> LaneType:
+        known = _TYPES.get(lane.type.lower())
+        if known is not None:
+            return known
+        self._once(
+            "approximated",
+            "lane type",
+            f"road {road.id} lane {lane.id}",
+            f"type '{lane.type}' is not in the standard: taken as none",
+            lane.line,
+        )
+        return LaneType.NONE
+
+    def _speed(self, road: RawRoad, lane: RawLane, section: RawSection, s: float) -> float:
+        speed: float | None = None
+        road_type = ""
+        for start, kind, limit in road.types:
+            if start <= s + 1e-9:
+                road_type, speed = kind, limit
+        for start, limit in lane.speeds:
+            if section.s + start <= s + 1e-9:
+                speed = limit
+        if speed is None:
+            speed = DEFAULT_SPEED.get(road_type, URBAN_SPEED)
+            self._once(
+                "approximated",
+                "speed limit",
+                f"road {road.id}",
+                f"the file gives none for road type '{road_type}': {speed * 3.6:.0f} km/h assumed",
+                road.line,
+            )
+        elif speed == float("inf"):
+            speed = NO_LIMIT_SPEED
+            self._once(
+                "approximated",
+                "speed limit",
+                f"road {road.id}",
+                f"'no limit': {speed * 3.6:.0f} km/h assumed",
+                road.line,
+            )
+        return speed
+
+    def _access(self, road: RawRoad, lane: RawLane, kind: LaneType, s: float) -> frozenset[str]:
+        access = _ACCESS.get(kind, MOTOR_CLASSES if kind in DRIVABLE else frozenset())
+        active = [r for r in lane.access if r[0] <= s + 1e-9]
+        if not active:
+            return access
+        latest = active[-1][0]
+        for _, rule, who in (r for r in active if r[0] == latest):
+            classes = {_RESTRICTIONS[w.lower()] for w in who if w.lower() in _RESTRICTIONS}
+            unknown = [w for w in who if w.lower() not in _RESTRICTIONS and w.lower() != "none"]
+            if unknown:
+                self._once(
+                    "ignored",
+                    "lane access",
+                    f"road {road.id} lane {lane.id}",
+                    f"restriction '{unknown[0]}' names no vehicle class",
+                    lane.line,
+                )
+            if rule == "allow":
+                access = frozenset(classes)
+            else:
+                access = access - classes
+        return access
+
+    def _once(self, action: str, element: str, where: str, message: str, line: int | None) -> None:
+        """Report, but the same thing only once."""
+        if not any(n.where == where and n.message == message for n in self.report.notes):
+            getattr(self.report, action)(element, where, message, line)
+
+
+def _near(s: float, places: set[float]) -> bool:
+    return any(abs(s - p) < MIN_SECTION for p in places)
+
+
+def _changes(lane: RawLane) -> list[float]:
+    """Where, from the section start, something besides geometry may change on a lane."""
+    return [m.s for m in lane.marks] + [s for s, _ in lane.speeds] + [s for s, _, _ in lane.access]
+
+
+def _forward(road: RawRoad, lane: RawLane) -> bool:
+    forward = (lane.id < 0) != road.left_hand
+    return not forward if lane.forward_sign == 1 else forward
+
+
+def _ever_wide(shape: RoadShape, section: RawSection, number: int) -> bool:
+    end = max(section.end, section.s)
+    s = np.linspace(section.s, end, 17)
+    return bool(shape.profile(section, s, s)[number][1].max() >= MIN_WIDTH)
+
+
+def _may_mix(types: dict[int, LaneType], forward: dict[int, bool], a: int, b: int) -> bool:
+    return types[a] in DRIVABLE and types[b] in DRIVABLE and forward[a] == forward[b]
+
+
+def _permission(section: RawSection, low: int, high: int, s: float) -> tuple[bool, bool]:
+    """Whether marks let traffic cross from lane `low` up to lane `high`, and from `high` down."""
+    up = down = True
+    borders = [n for n in range(low, high + 1) if low < n <= 0 or 0 <= n < high]
+    for number in borders:
+        lane = section.lanes.get(number)
+        mark = None
+        for candidate in lane.marks if lane is not None else []:
+            if candidate.s <= s + 1e-9:
+                mark = candidate
+        if mark is not None:
+            mark_up, mark_down = crossing(mark, number)
+            up, down = up and mark_up, down and mark_down
+    return up, down
+
+
+def crossing(mark: Mark, number: int) -> tuple[bool, bool]:
+    """Whether a mark on the outer border of lane `number` may be crossed towards larger and smaller t.
+
+    `laneChange` says it outright. Without it the lines decide: of two lines the one on the driver's
+    own side counts. Two-line types name the inner line first, on lane 0 the left one (OpenDRIVE 1.8,
+    section 11.9).
+    """
+    match mark.change:
+        case "both":
+            return True, True
+        case "none":
+            return False, False
+        case "increase":
+            return True, False
+        case "decrease":
+            return False, True
+    if "no passing" in mark.rules:
+        return False, False
+    lines = [line in ("broken", "none", "custom", "dots") for line in mark.type.replace("botts ", "").split()]
+    if len(lines) < 2:
+        allowed = bool(lines) and lines[0]
+        return allowed, allowed
+    first, second = lines[0], lines[1]
+    # for right lanes and lane 0 the first line is the one at larger t
+    high_side, low_side = (first, second) if number <= 0 else (second, first)
+    return low_side, high_side
+
+
+# --- sampling -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Values of all lanes of a piece at common road coordinates; first axis lanes, last axis samples."""
+
+    x: Array
+    y: Array
+    heading: Array
+    curvature: Array
+    width: Array
+    along: Array  # d(position)/ds in road direction
+    across: Array
+
+
+Evaluate = Callable[[Array, NDArray[np.int64]], _Samples]
+
+
+def sample_piece(road: RawRoad, piece: Piece, report: ImportReport) -> dict[int, Lane]:
+    """The lanes of a piece by lane number, without links and neighbours."""
+    shape = RoadShape(road)
+    numbers = sorted(piece.attributes)
+    if not numbers:
+        return {}
+    spans = [
+        (section, a, b)
+        for section, start, end in piece.parts
+        for a, b in itertools.pairwise([start, *shape.knots(section, start, end), end])
+    ]
+    sections = [section for section, _, _ in spans]
+    a, b = np.array([s[1] for s in spans]), np.array([s[2] for s in spans])
+    middle = (a + b) / 2
+
+    def evaluate(s: Array, span: NDArray[np.int64]) -> _Samples:
+        return _evaluate(shape, numbers, sections, s, span, middle[span])
+
+    # at every border of spans: how far do the left and right limits differ?
+    here = np.arange(len(spans) - 1)
+    before, after = evaluate(b[:-1], here), evaluate(a[1:], here + 1)
+    jump = np.hypot(after.x - before.x, after.y - before.y).max(0, initial=0.0)
+    turn = np.abs(np.angle(np.exp(1j * (after.heading - before.heading)))).max(0, initial=0.0)
+    step = np.abs(after.width - before.width).max(0, initial=0.0)
+    kink = (jump > 1e-6) | (turn > 1e-5) | (step > 1e-6)
+    room = (b - a) / 4
+    half = np.where(kink, np.maximum(5e-4, 20 * np.maximum(jump - 1e-5, 0.0)), 0.0)
+    half = np.minimum(half, np.minimum(room[:-1], room[1:]))
+    start = a + np.concatenate([[0.0], half])
+    end = b - np.concatenate([half, [0.0]])
+    for s, gap in zip(b[:-1][jump > 1e-3], jump[jump > 1e-3], strict=True):
+        report.approximated(
+            "lane geometry",
+            f"road {road.id} s={s:.3f}",
+            f"jumps by {gap * 1000:.1f} mm between two records: smoothed over {40 * gap:.2f} m",
+            road.line,
+        )
+
+    count = _intervals(shape, evaluate, start, end)
+    s_list, span_list, bridge_list = [], [], []
+    for i, n in enumerate(count):
+        s = np.linspace(start[i], end[i], n + 1)
+        bridged = i > 0 and half[i - 1] > 0.0
+        if i > 0 and not bridged:  # the last sample of the span before is this one
+            s = s[1:]
+        s_list.append(s)
+        span_list.append(np.full(len(s), i))
+        bridge_list.append(np.arange(len(s)) < bridged)
+    s, span, bridge = (np.concatenate(parts) for parts in (s_list, span_list, bridge_list))
+    values = evaluate(s, span)
+    z = road.elevation(s, middle[span])
+    lengths = _lengths(evaluate, s, span, bridge, values)
+
+    lanes: dict[int, Lane] = {}
+    for row, number in enumerate(numbers):
+        attributes = piece.attributes[number]
+        _report_shape(report, road, piece, number, values, row)
+        arc = np.concatenate([[0.0], np.cumsum(lengths[row])])
+        heading = np.unwrap(values.heading[row])
+        curvature = values.curvature[row]
+        xyz = np.stack([values.x[row], values.y[row], z], -1)
+        width, road_s = values.width[row], s
+        if not attributes.forward:
+            arc = (arc[-1] - arc)[::-1]
+            heading = np.unwrap(heading[::-1] + np.pi)
+            curvature, xyz, width, road_s = -curvature[::-1], xyz[::-1], width[::-1], road_s[::-1]
+        lanes[number] = Lane(
+            id=lane_id((road.id, piece.index, number)),
+            road=road.id,
+            section=piece.index,
+            number=number,
+            type=attributes.type,
+            s=arc,
+            xyz=np.ascontiguousarray(xyz),
+            heading=heading,
+            curvature=np.ascontiguousarray(curvature),
+            width=np.ascontiguousarray(width),
+            road_s=np.ascontiguousarray(road_s),
+            speed_limit=attributes.speed,
+            access=attributes.access,
+            junction=road.junction,
+        )
+    return lanes
+
+
+def _evaluate(
+    shape: RoadShape,
+    numbers: list[int],
+    sections: list[RawSection],
+    s: Array,
+    span: NDArray[np.int64],
+    at: Array,
+) -> _Samples:
+    reference = shape.road.reference
+    x, y, heading, k, dk = reference.frame(s, at)
+    stretch = reference.stretch(at)
+    t = np.empty((len(numbers), 3, len(s)))
+    width = np.empty((len(numbers), len(s)))
+    distinct = {id(section): section for section in sections}
+    which = np.array([id(section) for section in sections])[span] if len(span) else np.zeros(0)
+    for key, section in distinct.items():
+        here = slice(None) if len(distinct) == 1 else np.nonzero(which == key)[0]
+        profile = shape.profile(section, s[here], at[here])
+        for row, number in enumerate(numbers):
+            t[row][:, here], width[row, here] = profile[number]
+    t0, t1, t2 = t[:, 0], t[:, 1], t[:, 2]
+    along = stretch * (1 - k * t0)
+    along_rate = -stretch * (dk * t0 + k * t1)
+    speed2 = np.maximum(along**2 + t1**2, 1e-18)
+    bend = along * (t2 + stretch * k * along) - t1 * (along_rate - stretch * k * t1)
+    return _Samples(
+        x=x - t0 * np.sin(heading),
+        y=y + t0 * np.cos(heading),
+        heading=heading + np.arctan2(t1, along),
+        curvature=bend / speed2**1.5,
+        width=width,
+        along=along,
+        across=t1,
+    )
+
+
+def _intervals(shape: RoadShape, evaluate: Evaluate, start: Array, end: Array) -> NDArray[np.int64]:
+    """How many sample intervals each span needs for the Hermite tolerance."""
+    index = np.repeat(np.arange(len(start)), 5)
+    s = (start[:, None] + (end - start)[:, None] * np.linspace(0, 1, 5)).ravel()
+    probe = evaluate(s, index)
+    bend = np.abs(probe.curvature).max(0).reshape(-1, 5).max(1)
+    varies = np.abs(probe.across).max(0).reshape(-1, 5).max(1) > 1e-9
+    step = np.minimum(10.0, (384 * _HERMITE / np.maximum(bend, 1e-9) ** 3) ** 0.25)
+    step = np.where(varies, np.minimum(step, 1.0), step)
+    middle = (start + end) / 2
+    step = np.where(shape.road.reference.is_parametric(middle), np.minimum(step, 0.5), step)
+    if not shape.road.elevation.constant:
+        step = np.minimum(step, 5.0)
+    return np.maximum(1, np.ceil((end - start) / np.maximum(step, 0.02)).astype(np.int64))
+
+
+def _lengths(
+    evaluate: Evaluate, s: Array, span: NDArray[np.int64], bridge: NDArray[np.bool_], values: _Samples
+) -> Array:
+    """Arc length of every lane between consecutive samples `[lanes, M-1]`, never quite zero."""
+    step = np.diff(s)
+    nodes = s[:-1, None] + step[:, None] * _X
+    probe = evaluate(nodes.ravel(), np.repeat(span[1:], len(_X)))
+    speed = np.hypot(probe.along, probe.across).reshape(len(values.x), -1, len(_X)) @ _W
+    chord = np.hypot(np.diff(values.x), np.diff(values.y))
+    return np.maximum(np.where(bridge[1:], chord, speed * step), 1e-9)
+
+
+def _report_shape(
+    report: ImportReport, road: RawRoad, piece: Piece, number: int, values: _Samples, row: int
+) -> None:
+    """Name lanes whose geometry is not that of a lane."""
+    where = f"road {road.id} section {piece.index} lane {number}"
+    if (values.along[row] <= 0).any():
+        report.approximated(
+            "lane geometry",
+            where,
+            "lies beyond the centre of the road's curve: its centre line runs backwards there",
+            road.line,
+        )
+    for section, a, b in piece.parts:
+        lane = section.lanes[number]
+        if lane.width is None:
+            continue
+        s = np.linspace(a, b, 33)
+        lowest = lane.width(s - section.s, s - section.s).min()
+        if lowest < -1e-3:
+            report.repaired(
+                "lane width", where, f"falls to {lowest:.3f} m: taken as 0 where negative", lane.line
+            )
