@@ -29,7 +29,8 @@ class Seam:
 
     def __str__(self) -> str:
         place = f" in junction {self.junction}" if self.junction is not None else ""
-        return f"{self.before} -> {self.after}{place}: gap {self.gap:.3f} m, kink {math.degrees(self.kink):.2f} deg"
+        jump = f"gap {self.gap:.3f} m, kink {math.degrees(self.kink):.2f} deg"
+        return f"{self.before} -> {self.after}{place}: {jump}"
 
 
 def seams(network: Network, *, gap: float = GAP, kink: float = KINK) -> Iterator[Seam]:

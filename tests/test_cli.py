@@ -1,0 +1,247 @@
+"""The command line: what it prints, what it writes, and how it refuses."""
+
+import gzip
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+import limsim_jax as lj
+from limsim_jax import cli
+
+LANES = """
+<lanes><laneSection s="0"><center><lane id="0" type="none"/></center><right>
+  <lane id="-1" type="driving"><link><predecessor id="-1"/><successor id="-1"/></link>
+    <width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
+</right></laneSection></lanes>
+"""
+
+
+def two_roads(*, gap: float = 0.0, turn: float = 0.0, extra: str = "") -> str:
+    """OpenDRIVE of two straight roads in a row; the second starts `gap` m late, turned by `turn` rad."""
+    return f"""<?xml version="1.0"?>
+<OpenDRIVE>
+<header revMajor="1" revMinor="4" name="two roads"/>
+<road name="" length="100" id="1" junction="-1">
+  <link><successor elementType="road" elementId="2" contactPoint="start"/></link>
+  <planView><geometry s="0" x="0" y="0" hdg="0" length="100"><line/></geometry></planView>{extra}{LANES}
+</road>
+<road name="" length="50" id="2" junction="-1">
+  <link><predecessor elementType="road" elementId="1" contactPoint="end"/></link>
+  <planView><geometry s="0" x="{100 + gap}" y="0" hdg="{turn}" length="50"><line/></geometry></planView>{LANES}
+</road>
+</OpenDRIVE>
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    """A function that writes a map and returns its path."""
+
+    def write(text: str, name: str = "map.xodr") -> str:
+        (tmp_path / name).write_text(text)
+        return str(tmp_path / name)
+
+    return write
+
+
+@pytest.fixture
+def run(capsys):
+    """A function that runs a command in this process and returns exit code, stdout and stderr."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        code = cli.main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+def test_version(run):
+    assert run("--version") == (0, f"limsim-jax {lj.__version__}\n", "")
+
+
+def test_help_names_every_command():
+    result = CliRunner().invoke(cli.app, ["map", "--help"])
+    assert result.exit_code == 0
+    for command in ("info", "draw", "check"):
+        assert command in result.output
+
+
+@pytest.mark.parametrize("name", sorted(lj.bundled_maps()))
+def test_info_on_bundled_maps(name, run, tmp_path):
+    code, out, err = run("map", "info", name, "--json", tmp_path / "info.json")
+    network = lj.load_map(lj.bundled_map(name))
+    assert (code, err) == (0, "")
+    facts = json.loads((tmp_path / "info.json").read_text())
+    assert facts["lanes"] == len(network.lanes)
+    assert facts["drivable_km"] == pytest.approx(
+        sum(lane.length for lane in network.drivable_lanes()) / 1e3, abs=1e-3
+    )
+    assert facts["junctions"] == len(network.junctions)
+    assert facts["traffic_lights"] == len(network.traffic_lights)
+    assert facts["bounds_m"] == pytest.approx(network.bounds(), abs=0.01)
+    assert facts["report"]["counts"]["lane"]["read"] > 0
+    assert str(facts["drivable_km"]) in out and "approximated" in out
+
+
+def test_info_is_right_about_a_known_map(run, write, tmp_path):
+    code, out, _ = run("map", "info", write(two_roads()), "--json", tmp_path / "info.json")
+    assert code == 0
+    facts = json.loads((tmp_path / "info.json").read_text())
+    assert (facts["roads"], facts["drivable_lanes"], facts["drivable_km"]) == (2, 2, 0.15)
+    assert facts["bounds_m"] == [0, -1.75, 150, -1.75]
+    assert facts["format"] == "OpenDRIVE 1.4"
+    assert "0.15" in out
+
+
+def test_check_of_a_clean_map(run, write):
+    code, out, err = run("map", "check", write(two_roads()))
+    assert (code, err) == (0, "")
+    assert "no findings" in out and "seam" not in out
+
+
+@pytest.mark.parametrize(
+    ("fault", "jump"),
+    [
+        ({"gap": 0.02}, "gap 0.020 m, kink 0.00 deg"),
+        ({"turn": 0.01}, "kink 0.57 deg"),
+        ({"gap": 0.02, "turn": -0.01}, "kink -0.57 deg"),
+    ],
+)
+def test_check_finds_seams(fault, jump, run, write, tmp_path):
+    code, out, _ = run("map", "check", write(two_roads(**fault)), "--json", tmp_path / "check.json")
+    assert code == 1
+    assert jump in out and "1 finding\n" in out
+    result = json.loads((tmp_path / "check.json").read_text())
+    assert result["findings"] == len(result["seams"]) == 1
+
+
+def test_check_lets_small_steps_pass(run, write):
+    assert run("map", "check", write(two_roads(gap=0.008, turn=0.0002)))[0] == 0
+
+
+def test_strict_check_counts_what_was_ignored(run, write):
+    surface = (
+        '<surface><CRG file="bumps.crg" sStart="0" sEnd="9" orientation="same" mode="genuine"/></surface>'
+    )
+    file = write(two_roads().replace(f"{LANES}\n</road>", f"{LANES}{surface}\n</road>", 1))
+    lax, strict = run("map", "check", file), run("map", "check", file, "--strict")
+    assert (lax[0], strict[0]) == (0, 1)
+    assert "surface" in lax[1] and "surface" in strict[1]  # it is told in any case
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg"])
+def test_draw(suffix, run, write, tmp_path):
+    picture = tmp_path / f"map.{suffix}"
+    code, out, err = run("map", "draw", write(two_roads()), "-o", picture, "--labels", "--conflicts")
+    assert (code, err) == (0, "")
+    assert str(picture) in out
+    assert picture.read_bytes().startswith(b"\x89PNG" if suffix == "png" else b"<?xml")
+
+
+def test_draw_of_a_window_differs(run, write, tmp_path):
+    file = write(two_roads())
+    run("map", "draw", file, "-o", tmp_path / "all.png")
+    run("map", "draw", file, "-o", tmp_path / "part.png", "--bounds", "90,-10,110,10")
+    assert (tmp_path / "all.png").read_bytes() != (tmp_path / "part.png").read_bytes()
+
+
+def test_gzipped_maps_are_read(run, tmp_path):
+    (tmp_path / "map.xodr.gz").write_bytes(gzip.compress(two_roads().encode()))
+    code, out, _ = run("map", "info", tmp_path / "map.xodr.gz")
+    assert code == 0 and "OpenDRIVE 1.4" in out
+
+
+def test_no_cache_leaves_no_trace(run, write, tmp_path, monkeypatch):
+    monkeypatch.setenv("LIMSIM_JAX_CACHE", str(tmp_path / "cache"))
+    file = write(two_roads())
+    run("map", "info", file, "--no-cache")
+    assert not (tmp_path / "cache").exists()
+    run("map", "info", file)
+    assert (tmp_path / "cache").exists()
+
+
+FILES = {
+    "empty.xodr": b"",
+    "noise.xodr": bytes(range(256)),
+    "cut.xodr": two_roads()[:400].encode(),
+    "routes.rou.xml": b"<routes/>",
+    "nan.xodr": two_roads().replace('hdg="0"', 'hdg="nan"', 1).encode(),
+    "ok.xodr": two_roads().encode(),
+}
+
+REFUSALS = {
+    "missing file": ("map info none.xodr", "none.xodr"),
+    "missing file in a folder": ("map info nowhere/none.xodr", "nowhere/none.xodr"),
+    "unknown name": ("map info highwy", "bundled are"),
+    "folder": ("map info folder", "folder"),
+    "empty": ("map check empty.xodr", "empty"),
+    "noise": ("map check noise.xodr", "not well-formed"),
+    "cut": ("map check cut.xodr", "cut.xodr:"),
+    "other XML": ("map info routes.rou.xml", "<routes>"),
+    "not a number": ("map check nan.xodr", "hdg"),
+    "no file": ("map info", "FILE"),
+    "no output": ("map draw ok.xodr", "-o"),
+    "unknown picture": ("map draw ok.xodr -o ok.doc", ".doc"),
+    "output folder": ("map draw ok.xodr -o nowhere/ok.png", "nowhere"),
+    "bad bounds": ("map draw ok.xodr -o ok.png --bounds 1,2,3", "--bounds"),
+    "empty bounds": ("map draw ok.xodr -o ok.png --bounds 1,2,1,2", "bounds"),
+    "JSON folder": ("map info ok.xodr --json nowhere/x.json", "nowhere/x.json"),
+    "no such command": ("map explain ok.xodr", "explain"),
+    "no such option": ("map info ok.xodr --jsn x", "--jsn"),
+    "no runs": ("bench maps ok.xodr --repeats 0", "--repeats"),
+    "bench of nothing": ("bench maps none.xodr", "none.xodr"),
+    "bench of a cut file": ("bench maps cut.xodr --repeats 1", "cut.xodr:"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_user_errors_are_one_line(case, run, tmp_path, monkeypatch):
+    command, clue = REFUSALS[case]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    for name, content in FILES.items():
+        (tmp_path / name).write_bytes(content)
+    code, _, err = run(*command.split())
+    assert code == 2
+    assert err.startswith("limsim-jax: ") and err.count("\n") == 1
+    assert clue in err
+
+
+def test_bug_is_a_traceback(run, write, monkeypatch):
+    def broken(network):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(cli, "_facts", broken)
+    with pytest.raises(RuntimeError, match="a bug"):
+        run("map", "info", write(two_roads()))
+
+
+@pytest.mark.slow
+def test_bench(run, write, tmp_path):
+    file, out = write(two_roads()), tmp_path / "bench.json"
+    code, text, err = run("bench", "maps", file, "--repeats", "1", "--batch", "64", "--json", out)
+    assert (code, err) == (0, "")
+    result = json.loads(out.read_text())
+    assert {row["function"] for row in result["look_ups"]} == {"pose", "to_frenet", "project"}
+    assert all(row["look_ups_per_s"] > 0 and row["batch"] == 64 for row in result["look_ups"])
+    assert 0 < result["cached"]["total_s"] and 0 < result["cold"]["total_s"] < result["cold"]["process_s"]
+    assert result["machine"]["cores"] == 1
+    assert "`pose`" in text
+
+
+def script(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "limsim_jax.cli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | {"MPLBACKEND": "Agg"})
+
+
+def test_as_a_process(write):
+    done = script("map", "check", write(two_roads(gap=1.0)))
+    assert (done.returncode, done.stderr) == (1, "")
+    refused = script("map", "check", write("<OpenDRIVE>", "cut.xodr"))
+    assert refused.returncode == 2 and refused.stdout == ""
+    assert refused.stderr.startswith("limsim-jax: ") and refused.stderr.count("\n") == 1
