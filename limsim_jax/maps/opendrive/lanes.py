@@ -87,6 +87,7 @@ class Attributes:
     type: LaneType
     forward: bool  # traffic runs towards larger s
     speed: float
+    speed_assumed: bool  # the file gives none
     access: frozenset[str]
     change_up: bool  # may cross to the next lane at larger t, from this lane
     change_down: bool
@@ -300,10 +301,12 @@ class Cutter:
                     up = _permission(section, n, real[i + 1], s - section.s)[0]
                 if i > 0 and _may_mix(types, forward, n, real[i - 1]):
                     down = _permission(section, real[i - 1], n, s - section.s)[1]
+            speed, assumed = self._speed(road, section.lanes[n], section, s)
             result[n] = Attributes(
                 type=types[n],
                 forward=forward[n],
-                speed=self._speed(road, section.lanes[n], section, s),
+                speed=speed,
+                speed_assumed=assumed,
                 access=self._access(road, section.lanes[n], types[n], s - section.s),
                 change_up=up,
                 change_down=down,
@@ -323,7 +326,8 @@ class Cutter:
         )
         return LaneType.NONE
 
-    def _speed(self, road: RawRoad, lane: RawLane, section: RawSection, s: float) -> float:
+    def _speed(self, road: RawRoad, lane: RawLane, section: RawSection, s: float) -> tuple[float, bool]:
+        """Speed limit at `s`, and whether it had to be assumed."""
         speed: float | None = None
         road_type = ""
         for start, kind, limit in road.types:
@@ -332,8 +336,19 @@ class Cutter:
         for start, limit in lane.speeds:
             if section.s + start <= s + 1e-9:
                 speed = limit
-        if speed is None:
-            speed = DEFAULT_SPEED.get(road_type, URBAN_SPEED)
+        if speed == float("inf"):
+            self._once(
+                "approximated",
+                "speed limit",
+                f"road {road.id}",
+                f"'no limit': {NO_LIMIT_SPEED * 3.6:.0f} km/h assumed",
+                road.line,
+            )
+            return NO_LIMIT_SPEED, False
+        if speed is not None:
+            return speed, False
+        speed = DEFAULT_SPEED.get(road_type, URBAN_SPEED)
+        if road.junction is None:  # connectors take over the limits of the lanes they join, see reader
             self._once(
                 "approximated",
                 "speed limit",
@@ -341,16 +356,7 @@ class Cutter:
                 f"the file gives none for road type '{road_type}': {speed * 3.6:.0f} km/h assumed",
                 road.line,
             )
-        elif speed == float("inf"):
-            speed = NO_LIMIT_SPEED
-            self._once(
-                "approximated",
-                "speed limit",
-                f"road {road.id}",
-                f"'no limit': {speed * 3.6:.0f} km/h assumed",
-                road.line,
-            )
-        return speed
+        return speed, True
 
     def _access(self, road: RawRoad, lane: RawLane, kind: LaneType, s: float) -> frozenset[str]:
         access = _ACCESS.get(kind, MOTOR_CLASSES if kind in DRIVABLE else frozenset())
