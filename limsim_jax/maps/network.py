@@ -299,6 +299,8 @@ class Junction:
     movements: tuple[int, ...] = ()  # indices into `Network.movements`
     connectors: tuple[str, ...] = ()  # ids of all lanes inside the junction
     center: tuple[float, float] = (0.0, 0.0)  # m
+    outline: tuple[tuple[float, float], ...] = ()  # m, x y around its area, where the file draws it
+    roundabout: bool = False  # part of a roundabout, where the file says so
 
 
 @dataclass(frozen=True, kw_only=True)
