@@ -1,0 +1,371 @@
+"""LaneMap: against closed forms, the host network and brute force, in float32 unless said otherwise."""
+
+import dataclasses
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import fresnel
+
+from limsim_jax.maps import lane_map as lm
+from limsim_jax.maps.network import (
+    Action,
+    ImportReport,
+    Junction,
+    Lane,
+    LaneSpot,
+    LaneType,
+    MapError,
+    Network,
+    Road,
+    StopLine,
+)
+
+GAUSS_X, GAUSS_W = np.polynomial.legendre.leggauss(8)
+
+
+class Line:
+    """A reference line of clothoids: segments (length, first curvature, last curvature, turn before it)."""
+
+    def __init__(self, *segments, x=0.0, y=0.0, heading=0.0, step=0.5):
+        s, theta, kappa, xy = [0.0], [heading], [segments[0][1]], [np.array([x, y])]
+        for length, k0, k1, *turn in segments:
+            if turn:
+                s.append(s[-1] + 1e-3)
+                xy.append(xy[-1] + 1e-3 * np.array([np.cos(theta[-1]), np.sin(theta[-1])]))
+                theta.append(theta[-1] + turn[0])
+                kappa.append(k0)
+            count = max(1, int(np.ceil(length / step)))
+            u = np.linspace(0, length, count + 1)
+            angle = lambda v, t0=theta[-1], k0=k0, b=(k1 - k0) / (2 * length): t0 + k0 * v + b * v**2  # noqa: E731
+            h = length / count
+            inner = angle(u[:-1, None] + h * (GAUSS_X + 1) / 2)
+            steps = h / 2 * np.stack([np.cos(inner) @ GAUSS_W, np.sin(inner) @ GAUSS_W], -1)
+            xy.extend(xy[-1] + np.cumsum(steps, 0))
+            s.extend(s[-1] + u[1:])
+            kappa.extend(k0 + (k1 - k0) * u[1:] / length)
+            theta.extend(angle(u[1:]))
+        self.s, self.heading, self.curvature, self.xy = map(np.array, (s, theta, kappa, xy))
+
+    def lane(self, name, offset=0.0, width=3.5, z=0.0, reverse=False, **fields):
+        """The parallel at this offset (left > 0); `width` and `z` are numbers or functions of the reference s."""
+        normal = np.stack([-np.sin(self.heading), np.cos(self.heading)], -1)
+        xy = self.xy + offset * normal
+        z = np.broadcast_to(z(self.s) if callable(z) else z, self.s.shape)
+        width = np.broadcast_to(width(self.s) if callable(width) else width, self.s.shape).astype(float)
+        s = self.s - offset * (self.heading - self.heading[0])
+        xyz, heading = np.column_stack([xy, z]), self.heading
+        curvature, road_s = self.curvature / (1 - offset * self.curvature), self.s
+        if reverse:
+            s, xyz, heading = s[-1] - s[::-1], xyz[::-1], heading[::-1] + np.pi
+            curvature, road_s, width = -curvature[::-1], road_s[::-1], width[::-1]
+        return Lane(
+            id=name,
+            road=fields.pop("road", "road"),
+            number=fields.pop("number", -1),
+            speed_limit=fields.pop("speed_limit", 13.9),
+            s=s,
+            xyz=xyz,
+            heading=heading,
+            curvature=curvature,
+            width=width,
+            road_s=road_s,
+            **fields,
+        )
+
+
+def network(*lanes, **fields):
+    return Network(
+        name="test",
+        source="test.xodr",
+        file_hash="0",
+        format="test",
+        lanes={lane.id: lane for lane in lanes},
+        roads={lane.road: Road(id=lane.road) for lane in lanes},
+        **fields,
+    )
+
+
+WINDING = [
+    (60.0, 0.0, 0.0),
+    (40.0, 0.0, 1 / 30),
+    (50.0, 1 / 30, 1 / 30),
+    (40.0, 1 / 30, 0.0),
+    (35.0, 0.0, -1 / 12),
+    (20.0, -1 / 12, -1 / 12),
+    (120.0, 0.0, 0.0),
+]
+KINKED = [(20.0, 0.0, 0.0), (8.0, 0.0, 0.0, 0.3), (8.0, 0.0, 0.0, -0.2), (20.0, 0.0, 0.0, -0.25)]
+
+
+def swelling(s):
+    return 3.5 + 0.6 * np.sin(s / 40)
+
+
+def hill(s):
+    return 2.0 * np.cos(s / 60)
+
+
+def example():
+    """Three lanes of unequal widths that bend both ways, an oncoming one, a kinked one, a connector."""
+    line = Line(*WINDING, x=120.0, y=-40.0, heading=0.7)
+    kinked = Line(*KINKED, x=-60.0, y=30.0, heading=-2.0)
+    turn = Line((9.4, 1 / 6, 1 / 6), x=300.0, y=300.0, heading=3.0)
+    return network(
+        line.lane("inner", 0.0, swelling, hill, right="middle", may_change_right=True, opposite="oncoming"),
+        line.lane("middle", -3.6, 3.2, hill, left="inner", right="outer", number=-2, may_change_left=True),
+        line.lane("outer", -6.7, 3.0, hill, left="middle", number=-3, type=LaneType.EXIT),
+        line.lane("path", -9.0, 1.5, number=-4, type=LaneType.BIKING),
+        line.lane("oncoming", 3.6, 3.4, hill, reverse=True, number=1, access=frozenset({"bus", "car"})),
+        kinked.lane("kinked", road="2", speed_limit=8.3),
+        turn.lane("turn", road="3", junction="j", predecessors=("inner", "middle"), successors=("kinked",)),
+        stop_lines=(StopLine(id="1", spot=LaneSpot(lane="middle", s=100.0)),),
+        junctions={"i": Junction(id="i"), "j": Junction(id="j", connectors=("turn",))},
+    )
+
+
+@pytest.fixture(scope="module")
+def host():
+    return example()
+
+
+@pytest.fixture(scope="module")
+def device(host):
+    return lm.build_lane_map(host)
+
+
+@pytest.fixture(scope="module")
+def rows(host):
+    return lm.lane_rows(host)
+
+
+def double(lane_map):
+    """The same map in float64 (x64 has to be on)."""
+    return jax.tree.map(lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a, lane_map)
+
+
+def places(lane, count, rng, margin=0.0):
+    return rng.uniform(margin, lane.length - margin, count).astype(np.float32)
+
+
+pose = jax.jit(lm.pose)
+to_frenet = jax.jit(lm.to_frenet)
+project = jax.jit(lm.project)
+
+
+# --- against closed forms ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("radius", [6.0, -15.0, 200.0])
+def test_arc(radius):
+    length = min(1.5 * np.pi * abs(radius), 600.0)
+    lane_map = lm.build_lane_map(network(Line((length, 1 / radius, 1 / radius)).lane("a")))
+    s = np.linspace(0, length, 3001)
+    x, y, heading = (np.asarray(v, float) for v in pose(lane_map, 0, jnp.asarray(s, jnp.float32)))
+    x, y = lm.absolute(lane_map, x, y)
+    np.testing.assert_allclose(x, radius * np.sin(s / radius), atol=1.2e-3)
+    np.testing.assert_allclose(y, radius * (1 - np.cos(s / radius)), atol=1.2e-3)
+    assert np.abs(np.angle(np.exp(1j * (heading - s / radius)))).max() < np.deg2rad(0.11)
+    np.testing.assert_allclose(lm.curvature(lane_map, 0, jnp.asarray(s, jnp.float32)), 1 / radius, rtol=1e-3)
+    np.testing.assert_allclose(lane_map.curvature_max[0], 1 / abs(radius), rtol=1e-3)
+
+
+def test_clothoid_against_fresnel_integrals():
+    length, bend = 80.0, 1 / 20
+    lane_map = lm.build_lane_map(network(Line((length, 0.0, bend)).lane("a")))
+    s = np.linspace(0, length, 2001)
+    scale = np.sqrt(np.pi * length / bend)
+    sin, cos = fresnel(s / scale)
+    x, y, _ = pose(lane_map, 0, jnp.asarray(s, jnp.float32))
+    x, y = lm.absolute(lane_map, x, y)
+    np.testing.assert_allclose(x, scale * cos, atol=1.2e-3)
+    np.testing.assert_allclose(y, scale * sin, atol=1.2e-3)
+    curvature = lm.curvature(lane_map, 0, jnp.asarray(s, jnp.float32))
+    np.testing.assert_allclose(curvature, bend * s / length, rtol=1e-4, atol=1e-7)
+
+
+def test_lateral_offset_is_to_the_left():
+    lane_map = lm.build_lane_map(network(Line((40.0, 0.0, 0.0), heading=np.pi / 2).lane("north")))
+    x, y, heading = pose(lane_map, 0, jnp.float32(10), jnp.float32(2))
+    np.testing.assert_allclose(lm.absolute(lane_map, x, y), [-2, 10], atol=1e-5)
+    np.testing.assert_allclose(heading, np.pi / 2, rtol=1e-6)
+
+
+def test_lanes_go_on_straight_beyond_their_ends(device, host, rows):
+    lane = host.lanes["turn"]
+    for s, end in ((-7.0, 0.0), (lane.length + 7.0, lane.length)):
+        place, angle = lane.pose(end)
+        expected = place[:2] + (s - end) * np.array([np.cos(angle), np.sin(angle)])
+        x, y, heading = pose(device, rows["turn"], jnp.float32(s))
+        np.testing.assert_allclose(lm.absolute(device, x, y), expected, atol=1e-3)
+        np.testing.assert_allclose(np.exp(1j * float(heading)), np.exp(1j * angle), atol=1e-4)
+        found = to_frenet(device, rows["turn"], jnp.float32(end), x, y)
+        np.testing.assert_allclose(found[:2], [s, 0.0], atol=1e-3)
+
+
+# --- against the host -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["inner", "middle", "outer", "oncoming", "turn"])
+def test_device_lane_follows_host_lane(host, device, rows, name):
+    lane, row = host.lanes[name], rows[name]
+    s = places(lane, 5000, np.random.default_rng(0))
+    place, angle = lane.pose(s)
+    x, y, heading = pose(device, row, s)
+    ours = np.stack(lm.absolute(device, x, y), -1)
+    assert np.hypot(*(ours - place[:, :2]).T).max() < lm.TOLERANCE["position"] + 1e-4
+    assert np.abs(np.angle(np.exp(1j * (np.asarray(heading) - angle)))).max() < np.deg2rad(0.11)
+    np.testing.assert_allclose(lm.width(device, row, s), lane.width_at(s), atol=1.1e-3)
+    np.testing.assert_allclose(lm.elevation(device, row, s)[0], place[:, 2], atol=1e-2)
+
+
+def test_elevation_and_grade(host, device, rows):
+    s = places(host.lanes["inner"], 5000, np.random.default_rng(0))
+    z, grade = lm.elevation(device, rows["inner"], s)
+    np.testing.assert_allclose(z, hill(s), atol=1e-3)
+    np.testing.assert_allclose(grade, -2 / 60 * np.sin(s / 60), atol=1e-3)
+
+
+def test_spacing_is_a_power_of_two_and_coarse_where_the_lane_is_simple():
+    bends = [(16.0, 0.0, 0.0), (16.0, 1 / 500, 1 / 500), (16.0, 1 / 20, 1 / 20), (16.0, 1 / 5, 1 / 5)]
+    lanes = [Line(bend, x=50.0 * k).lane(str(k), road=str(k)) for k, bend in enumerate(bends)]
+    ds = np.asarray(lm.build_lane_map(network(*lanes)).ds)[:4]
+    assert (np.diff(ds[1:]) < 0).all()
+    assert ds[0] == 16.0
+    assert (np.log2(ds) % 1 == 0).all()
+
+
+def test_kinked_lane_is_followed_and_reported(host, device, rows):
+    lane = host.lanes["kinked"]
+    s = places(lane, 5000, np.random.default_rng(1))
+    x, y, _ = pose(device, rows["kinked"], s)
+    deviation = np.hypot(*(np.stack(lm.absolute(device, x, y), -1) - lane.pose(s)[0][:, :2]).T)
+    assert deviation.max() < 0.01
+    assert np.median(deviation) < 1e-4
+    report = ImportReport()
+    lm.build_lane_map(host, report=report)
+    assert [note.where for note in report.notes] == ["kinked"]
+    assert report.total(Action.APPROXIMATED) == 1
+    # A driver takes 0.3 rad over four metres, not the infinite curvature of the kink.
+    np.testing.assert_allclose(device.curvature_max[rows["kinked"]], 0.3 / lm.TURN_WINDOW, rtol=1e-3)
+
+
+def test_a_step_in_width_stays_a_step():
+    line = Line((50.0, 0.0, 0.0))
+    lane = line.lane("a")
+    s = np.sort(np.append(lane.s, 30.001))
+    fields = {"s": s, "xyz": np.stack([s, 0 * s, 0 * s], -1), "road_s": s, "width": np.where(s > 30, 5.0, 3.0)}
+    zeros = {"heading": 0 * s, "curvature": 0 * s}
+    lane_map = lm.build_lane_map(network(dataclasses.replace(lane, **fields, **zeros)))
+    width = lm.width(lane_map, 0, jnp.array([20.0, 29.4, 30.6, 40.0]))
+    np.testing.assert_allclose(width, [3.0, 3.0, 5.0, 5.0], atol=1e-3)
+
+
+def test_side_s_is_level_across_the_road(host, device, rows):
+    rng = np.random.default_rng(2)
+    for name, side, other in (("inner", -1, "middle"), ("middle", 1, "inner"), ("middle", -1, "outer")):
+        lane = host.lanes[name]
+        s = places(lane, 1000, rng)
+        ours = np.asarray(lm.side_s(device, rows[name], s, side))
+        truth = host.lanes[other].s_at_road(np.interp(s, lane.s, lane.road_s))
+        np.testing.assert_allclose(ours, truth, atol=5e-3)
+        # Level means: the neighbour's pose lies on the normal, with the same heading.
+        x, y, heading = pose(device, rows[name], s)
+        x2, y2, heading2 = pose(device, rows[other], ours)
+        along = (x2 - x) * np.cos(heading) + (y2 - y) * np.sin(heading)
+        assert np.abs(along).max() < 0.01
+    s = jnp.array([5.0, 6.0])
+    np.testing.assert_array_equal(lm.side_s(device, rows["outer"], s, -1), s)
+
+
+def test_lane_tables_say_what_the_network_says(host, device, rows):
+    def table(name, lane):
+        return np.asarray(getattr(device, name))[rows[lane]]
+
+    assert list(rows) == ["inner", "middle", "outer", "oncoming", "kinked", "turn"]
+    assert lm.lane_ids(host) == list(rows)
+    assert (table("left", "middle"), table("right", "middle")) == (rows["inner"], rows["outer"])
+    assert (table("left", "inner"), table("right", "outer")) == (lm.NO_LANE, lm.NO_LANE)
+    assert table("opposite", "inner") == rows["oncoming"]
+    assert (table("may_change_left", "middle"), table("may_change_right", "middle")) == (True, False)
+    lane, allowed = lm.neighbor(device, jnp.array([rows["middle"], rows["inner"]]), jnp.array([1, -1]))
+    assert lane.tolist() == [rows["inner"], rows["middle"]]
+    assert allowed.tolist() == [True, True]
+    assert table("successors", "turn").tolist() == [rows["kinked"], -1, -1, -1]
+    assert table("predecessors", "turn").tolist() == [rows["inner"], rows["middle"], -1, -1]
+    assert (table("is_connector", "turn"), table("is_connector", "inner")) == (True, False)
+    assert (table("junction", "turn"), table("junction", "inner")) == (1, -1)
+    np.testing.assert_allclose(table("stop_s", "middle"), 100.0)
+    np.testing.assert_allclose(table("stop_s", "inner"), host.lanes["inner"].length)
+    assert lm.LANE_TYPES[table("lane_type", "outer")] is LaneType.EXIT
+    allowed = [c for i, c in enumerate(lm.VEHICLE_CLASSES) if table("access", "oncoming") >> i & 1]
+    assert allowed == ["car", "bus"]
+    np.testing.assert_allclose(table("speed_limit", "kinked"), 8.3)
+    np.testing.assert_allclose(table("length", "inner"), host.lanes["inner"].length)
+
+
+def test_turn_speed(device, rows):
+    fast = lm.turn_speed(device, jnp.array([rows["turn"], rows["inner"]]), 3.0)
+    np.testing.assert_allclose(fast, [np.sqrt(3.0 * 6.0), np.sqrt(3.0 * 12.0)], rtol=2e-3)
+    straight = lm.build_lane_map(network(Line((40.0, 0.0, 0.0)).lane("a")))
+    np.testing.assert_allclose(lm.turn_speed(straight, 0, 3.0), 13.9)
+
+
+def test_more_links_than_usual_fit():
+    line = Line((20.0, 0.0, 0.0))
+    many = [line.lane(f"b{k}", number=k) for k in range(7)]
+    fork = line.lane("fork", road="2", successors=tuple(lane.id for lane in many))
+    lane_map = lm.build_lane_map(network(fork, *many))
+    assert lane_map.successors[0].tolist() == [1, 2, 3, 4, 5, 6, 7, -1]
+
+
+# --- Frenet -----------------------------------------------------------------------------------------
+
+
+def long_network(single):
+    """10 km from end to end, with bends, as one lane or as 40 of them; left and right edges by width 7 m."""
+    bends = [(40.0, 0.0, 1 / 60), (40.0, 1 / 60, 0.0), (40.0, 0.0, -1 / 60), (40.0, -1 / 60, 0.0)]
+    block = [(90.0, 0.0, 0.0), *bends]
+    if single:
+        return network(Line(*(block * 40), step=1.0).lane("a", width=7.0))
+    starts = np.linspace(-5000, 4750, 40)
+    return network(
+        *(Line(*block, x=x, y=0.7 * x, heading=0.2 * k, step=1.0).lane(str(k), width=7.0)
+          for k, x in enumerate(starts))
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("single", [True, False])
+def test_round_trip_on_ten_kilometres(single):
+    host = long_network(single)
+    lane_map = lm.build_lane_map(host)
+    rng = np.random.default_rng(3)
+    lane = rng.integers(0, len(host.lanes), 100_000)
+    s = (rng.uniform(0, 1, len(lane)) * np.asarray(lane_map.length)[lane]).astype(np.float32)
+    d = rng.uniform(-3.5, 3.5, len(lane)).astype(np.float32)
+    extent = np.ptp(host.bounds()[0::2]), np.ptp(host.bounds()[1::2])
+    assert max(extent) > 8000
+    x, y, heading = pose(lane_map, lane, s, d)
+    guess = s + rng.uniform(-4, 4, len(lane)).astype(np.float32)
+    s2, d2, heading2 = (np.asarray(v) for v in to_frenet(lane_map, lane, guess, x, y))
+    assert np.abs(s2 - s).max() < 1e-3
+    assert np.abs(d2 - d).max() < 1e-3
+    np.testing.assert_allclose(heading2, heading, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["inner", "outer", "oncoming", "turn"])
+def test_round_trip_in_bends(host, device, rows, name):
+    """Also where the point is close to the centre of curvature, and from guesses many intervals away."""
+    lane, rng = host.lanes[name], np.random.default_rng(4)
+    s = places(lane, 20_000, rng)
+    bend = np.interp(s, lane.s, lane.curvature)
+    d = rng.uniform(-6, 6, len(s))
+    d = np.clip(d, *np.sort([0.7 / np.where(bend == 0, 1e-9, bend), -6 * np.sign(bend + 1e-12)], 0)).astype(np.float32)
+    x, y, _ = pose(device, rows[name], s, d)
+    guess = s + rng.uniform(-3, 3, len(s)).astype(np.float32)
+    s2, d2, _ = (np.asarray(v) for v in to_frenet(device, rows[name], guess, x, y))
+    assert np.abs(s2 - s).max() < 1e-3
+    assert np.abs(d2 - d).max() < 1e-3
