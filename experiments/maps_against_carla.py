@@ -1,0 +1,790 @@
+"""Our reading of OpenDRIVE maps against CARLA's parser and against the formulas of the standard.
+
+    python experiments/maps_against_carla.py [--maps DIR|FILE ...] [--json FILE] [--markdown FILE]
+
+For every map: each driving waypoint that CARLA's parser generates (every 0.5 m) is looked for on the
+lane of ours with the same road, number and road coordinate, on the host (`Network`) and on the device
+(`LaneMap`). Movements across junctions, lane widths, permissions to change lanes, lights, signs and
+crosswalks are compared as well. Every driving lane is also compared with OpenDRIVE's formulas evaluated
+directly (`opendrive_formulas.py`), which settles who is right where CARLA and we differ.
+
+CARLA's parser (PyPI `carla`) runs in a process of its own, as it crashes on some maps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from opendrive_formulas import LaneEnd, LaneKey, OpenDriveFormulas, paths_across
+
+from limsim_jax.maps.network import Lane, LaneType, Network, SignKind
+
+REPO = Path(__file__).resolve().parents[1]
+SHARED = Path(os.environ.get("LIMSIM_SHARED_DATA", REPO.parent / "shared" / "data"))
+RESULTS = REPO / "experiments" / "results"
+
+# What a map has to show, in SI units.
+HOST_LATERAL = 1e-3
+DEVICE_LATERAL = 0.05
+DEVICE_MEDIAN = 0.01
+HEADING = math.radians(1.0)
+WIDTH = 0.01
+LENGTH = 1e-3  # of the length
+
+Array = NDArray[np.float64]
+
+
+# --- CARLA's side, in a process of its own ------------------------------------------------------------------
+
+
+def _answer(source: Path, out: Path) -> None:
+    """Ask CARLA's parser about a map; write each answer as soon as it is there."""
+    import carla
+
+    town = carla.Map("map", source.read_text(encoding="utf-8", errors="replace"))
+    waypoints = town.generate_waypoints(0.5)
+    change = carla.LaneChange
+    rows = [
+        (
+            w.road_id,
+            w.section_id,
+            w.lane_id,
+            w.s,
+            w.transform.location.x,
+            -w.transform.location.y,
+            -math.radians(w.transform.rotation.yaw),
+            w.lane_width,
+            bool(int(w.lane_change) & int(change.Left)),
+            bool(int(w.lane_change) & int(change.Right)),
+        )
+        for w in waypoints
+    ]
+    np.save(out / "waypoints.npy", np.array(rows, float).reshape(-1, 10))
+
+    def key(w: Any) -> tuple[int, int, int]:
+        return w.road_id, w.section_id, w.lane_id
+
+    topology = town.get_topology()
+    kinds = {
+        key(w): (str(w.lane_type), w.junction_id if w.is_junction else None) for e in topology for w in e
+    }
+    (out / "topology.json").write_text(
+        json.dumps({"links": [(key(a), key(b)) for a, b in topology], "lanes": list(kinds.items())})
+    )
+    crosswalks = [(p.x, -p.y) for p in town.get_crosswalks()]
+    (out / "crosswalks.json").write_text(json.dumps(crosswalks))
+    landmarks = [
+        {
+            "id": mark.id,
+            "type": mark.type,
+            "road": mark.road_id,
+            "s": mark.s,
+            "orientation": str(mark.orientation),
+            "lanes": mark.get_lane_validities(),
+            "dynamic": mark.is_dynamic,
+        }
+        for mark in town.get_all_landmarks()
+    ]
+    (out / "landmarks.json").write_text(json.dumps(landmarks))
+
+
+@dataclass(frozen=True)
+class CarlaMap:
+    """What CARLA's parser says about a map; fields that it crashed on are None."""
+
+    waypoints: Array | None  # [K, 10]: road, section, lane, s, x, y, heading, width, may change left, right
+    topology: dict[str, Any] | None
+    crosswalks: list[tuple[float, float]] | None
+    landmarks: list[dict[str, Any]] | None
+    said: tuple[str, ...]  # what it printed
+    failure: str | None
+
+
+def ask_carla(source: Path, timeout: float = 120.0) -> CarlaMap:
+    """CARLA's answers about a map, from a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        command = [sys.executable, str(Path(__file__).resolve()), "--answer", str(source), str(out)]
+        failure = None
+        try:
+            run = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+            said, code = (run.stdout + run.stderr).splitlines(), run.returncode
+        except subprocess.TimeoutExpired:
+            said, code, failure = [], 0, f"no answer within {timeout:g} s"
+        if code < 0:
+            failure = f"crashes (signal {-code})"
+        elif code:
+            failure = f"raises: {said[-1] if said else '?'}"
+            said = [line for line in said if not line.startswith((" ", "Traceback"))][:-1]
+
+        def load(name: str) -> Any:
+            path = out / f"{name}.json"
+            return json.loads(path.read_text()) if path.exists() else None
+
+        waypoints = out / "waypoints.npy"
+        return CarlaMap(
+            waypoints=np.load(waypoints) if waypoints.exists() else None,
+            topology=load("topology"),
+            crosswalks=load("crosswalks"),
+            landmarks=load("landmarks"),
+            said=tuple(line.strip() for line in said if line.strip()),
+            failure=failure,
+        )
+
+
+# --- Where a point lies on our lanes ------------------------------------------------------------------------
+
+
+@dataclass
+class Misfit:
+    """Deviations of given poses from our lanes, one entry per pose; NaN where no lane of ours is there."""
+
+    lateral: Array  # m, across the track
+    along: Array  # m, along the track, from where the road coordinate says
+    heading: Array  # rad
+    width: Array  # m
+    device: Array  # m, across the track, of the device lane
+    may_left: Array  # 1 or 0 where our lane has a driving lane beside it, else NaN
+    may_right: Array
+    lane: list[str]
+
+    @classmethod
+    def empty(cls, count: int) -> Misfit:
+        """All NaN."""
+        return cls(*(np.full(count, np.nan) for _ in range(7)), lane=[""] * count)
+
+    def bad(self) -> NDArray[np.bool_]:
+        """Poses for which the host lane misses a threshold."""
+        good = (self.lateral < HOST_LATERAL) & (self.heading < HEADING) & (self.width < WIDTH)
+        return ~good
+
+
+def project(lane: Lane, xy: Array, s: Array) -> tuple[Array, Array, Array]:
+    """Arc length, signed offset to the left and residual along the lane of the points' local projections."""
+    for _ in range(8):
+        position, heading = lane.pose(s)
+        delta = xy - position[:, :2]
+        along = delta[:, 0] * np.cos(heading) + delta[:, 1] * np.sin(heading)
+        s = np.clip(s + along, 0.0, lane.length)
+    position, heading = lane.pose(s)
+    delta = xy - position[:, :2]
+    c, n = np.cos(heading), np.sin(heading)
+    return s, delta[:, 1] * c - delta[:, 0] * n, delta[:, 0] * c + delta[:, 1] * n
+
+
+class OurMap:
+    """Our lanes, found by road and number, on host and device."""
+
+    def __init__(self, network: Network) -> None:
+        """Index the driving lanes and build the device map."""
+        self.network = network
+        self.lanes: dict[tuple[str, int], list[Lane]] = {}
+        for lane in network.lanes.values():
+            if lane.type is LaneType.DRIVING:
+                self.lanes.setdefault((lane.road, lane.number), []).append(lane)
+        self._device = device_poses(network)
+
+    def misfit(self, where: Sequence[tuple[str, int]], s: Array, pose: Array, width: Array) -> Misfit:
+        """Deviation of poses `[K, 3]` (m, m, rad), given at road coordinates `s` of (road, lane number)."""
+        out = Misfit.empty(len(where))
+        groups: dict[tuple[str, int], list[int]] = {}
+        for i, place in enumerate(where):
+            groups.setdefault(place, []).append(i)
+        for place, members in groups.items():
+            rows = np.array(members)
+            for lane in self.lanes.get(place, ()):
+                lo, hi = sorted((lane.road_s[0], lane.road_s[-1]))
+                inside = rows[(s[rows] >= lo - 1e-6) & (s[rows] <= hi + 1e-6)]
+                if len(inside):
+                    self._fit(lane, inside, s, pose, width, out)
+        return out
+
+    def _fit(
+        self, lane: Lane, rows: NDArray[np.int_], s: Array, pose: Array, width: Array, out: Misfit
+    ) -> None:
+        start = lane.s_at_road(s[rows])
+        at, lateral, residual = project(lane, pose[rows, :2], start)
+        # A point beyond the end of the lane is off by as much as it is beyond, less rounding.
+        lateral = np.hypot(lateral, np.maximum(np.abs(residual) - 1e-4, 0.0))
+        better = ~(lateral >= out.lateral[rows])  # also where there is none so far
+        rows, at, start, lateral = rows[better], at[better], start[better], lateral[better]
+        if not len(rows):
+            return
+        out.lateral[rows], out.along[rows] = lateral, np.abs(at - start)
+        _, heading = lane.pose(at)
+        out.heading[rows] = np.abs(np.angle(np.exp(1j * (pose[rows, 2] - heading))))
+        # At the same road coordinate: where arc length is measured anew, points shift along the road.
+        out.width[rows] = np.abs(width[rows] - lane.width_at(start))
+        on_device, device_heading = self._device(lane, at)
+        delta = pose[rows, :2] - on_device
+        out.device[rows] = np.abs(delta[:, 1] * np.cos(device_heading) - delta[:, 0] * np.sin(device_heading))
+        out.may_left[rows] = lane.may_change_left if self._driving(lane.left) else np.nan
+        out.may_right[rows] = lane.may_change_right if self._driving(lane.right) else np.nan
+        for row in rows:
+            out.lane[row] = lane.id
+
+    def _driving(self, lane: str | None) -> bool:
+        return lane is not None and self.network.lanes[lane].type is LaneType.DRIVING
+
+    def on_any_lane(self, pose: Array) -> NDArray[np.bool_]:
+        """Which of these poses lie on a driving lane of ours, whatever its name, within the device's 5 cm."""
+        found = np.zeros(len(pose), bool)
+        if not found.size:
+            return found
+        for lane in (lane for lanes in self.lanes.values() for lane in lanes):
+            step = max(1, int(0.5 / max(lane.length / len(lane.s), 1e-3)))
+            knots = np.unique(np.append(np.arange(0, len(lane.s), step), len(lane.s) - 1))
+            gap = np.hypot(*(pose[:, None, :2] - lane.xyz[knots, :2]).transpose(2, 0, 1))
+            close = np.flatnonzero((gap.min(1) < 25.0) & ~found)
+            if len(close):
+                _, lateral, residual = project(lane, pose[close, :2], lane.s[knots[gap[close].argmin(1)]])
+                found[close] = (np.abs(lateral) < DEVICE_LATERAL) & (np.abs(residual) < DEVICE_LATERAL)
+        return found
+
+
+def device_poses(network: Network) -> Any:
+    """A function (lane, s) -> position `[K, 2]` and heading `[K]` of the device lane, in float64."""
+    import jax
+    import jax.numpy as jnp
+
+    from limsim_jax.maps import lane_map as lm
+
+    lane_map = lm.build_lane_map(network)
+    rows = lm.lane_rows(network)
+    origin = np.asarray(lane_map.origin, np.float64)[:2]
+    pose = jax.jit(lm.pose)
+
+    def at(lane: Lane, s: Array) -> tuple[Array, Array]:
+        size = 1 << max(6, (len(s) - 1).bit_length())  # few sizes, few compilations
+        padded = jnp.asarray(np.pad(s, (0, size - len(s))), jnp.float32)
+        x, y, heading = pose(lane_map, jnp.full(size, rows[lane.id], jnp.int32), padded)
+        xy = np.stack([np.asarray(x, np.float64), np.asarray(y, np.float64)], -1)[: len(s)]
+        return xy + origin, np.asarray(heading, np.float64)[: len(s)]
+
+    return at
+
+
+# --- Comparisons --------------------------------------------------------------------------------------------
+
+
+def spread(values: Array) -> dict[str, float | None]:
+    """Median, 99th percentile and maximum, in thousandths of the unit."""
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return {"median": None, "p99": None, "max": None}
+    median, p99 = np.percentile(values, (50, 99))
+    return {"median": 1e3 * float(median), "p99": 1e3 * float(p99), "max": 1e3 * float(values.max())}
+
+
+def integer_ids(ids: Iterable[str]) -> dict[int, str] | None:
+    """CARLA's integer -> id in the file; None where the cast loses ids."""
+    ids = list(ids)
+    if not all(re.fullmatch(r"\d{1,9}", i) for i in ids):
+        return None
+    cast = {int(i): i for i in ids}
+    return cast if len(cast) == len(ids) else None
+
+
+@dataclass
+class Comparison:
+    """One row of the table."""
+
+    map: str
+    failure: str | None = None  # why CARLA's parser gives no answer
+    said: tuple[str, ...] = ()  # what it printed
+    figures: dict[str, Any] = field(default_factory=dict)
+    exceptions: list[str] = field(default_factory=list)  # differences in which the file is on our side
+    misses: list[str] = field(default_factory=list)  # differences in which it is not
+
+    @property
+    def verdict(self) -> str:
+        """One word."""
+        return "MISS" if self.misses else "pass" if self.failure is None else "referee fails"
+
+
+def compare_poses(ours: OurMap, carla_map: CarlaMap, truth: OpenDriveFormulas, row: Comparison) -> None:
+    """Waypoints of CARLA's parser on our lanes."""
+    waypoints = carla_map.waypoints
+    names = integer_ids(truth.roads)
+    if waypoints is None or names is None:
+        return
+    row.figures["waypoints"] = len(waypoints)
+    sound = np.isfinite(waypoints).all(1)
+    if not sound.all():
+        row.exceptions.append(f"{(~sound).sum()} waypoints of CARLA are NaN")
+    waypoints = waypoints[sound]
+    where = [(names[int(w[0])], int(w[2])) for w in waypoints]
+    s, pose, width = waypoints[:, 3], waypoints[:, 4:7], waypoints[:, 7]
+    fit = ours.misfit(where, s, pose, width)
+
+    nowhere = np.isnan(fit.lateral) | (fit.lateral > DEVICE_LATERAL)
+    nowhere[nowhere] = ~ours.on_any_lane(pose[nowhere])
+    bad = np.flatnonzero(fit.bad() | (fit.device > DEVICE_LATERAL))
+    carla_errs = np.zeros(len(waypoints), bool)
+    for roads in [sorted({where[i][0] for i in bad})]:
+        for road in roads:
+            rows = [i for i in bad if where[i][0] == road]
+            carla_errs[rows] = formulas_side_with_us(ours, truth, waypoints[rows], road)
+    if carla_errs.any():
+        row.exceptions.append(describe_errors(waypoints[carla_errs], names, truth, fit, carla_errs))
+    kept = ~carla_errs
+    figures = row.figures
+    figures["host"], figures["device"] = spread(fit.lateral[kept]), spread(fit.device[kept])
+    figures["along"], figures["width"] = spread(fit.along[kept]), spread(fit.width[kept])
+    heading = np.degrees(fit.heading[kept])
+    figures["heading_deg"] = float(np.nanmax(heading, initial=0.0))
+    figures["carla_errs"] = int(carla_errs.sum())
+    figures["outside"] = int((nowhere & kept).sum())
+
+    for name, at in (
+        ("no lane of ours there", np.isnan(fit.lateral)),
+        ("host lane off across the track", fit.lateral >= HOST_LATERAL),
+        ("device lane off across the track", fit.device >= DEVICE_LATERAL),
+        ("heading off", fit.heading >= HEADING),
+        ("width off", fit.width >= WIDTH),
+    ):
+        if (at & kept).any():
+            i = np.flatnonzero(at & kept)
+            row.misses.append(f"{len(i)} waypoints: {name}, e.g. {places(waypoints[i], names)}")
+    if (figures["device"]["median"] or 0.0) >= 1e3 * DEVICE_MEDIAN:
+        row.misses.append(f"device lanes off by {figures['device']['median']:.1f} mm in the median")
+    compare_permissions(fit, waypoints, where, truth, row)
+
+
+def places(waypoints: Array, names: dict[int, str], count: int = 3) -> str:
+    """A few lanes and road coordinates in words."""
+    lanes: dict[tuple[str, int], float] = {}
+    for w in waypoints:
+        lanes.setdefault((names[int(w[0])], int(w[2])), w[3])
+    text = [f"road {road} lane {lane} s {s:.1f}" for (road, lane), s in list(lanes.items())[:count]]
+    return ", ".join(text) + (f" (and {len(lanes) - count} lanes more)" if len(lanes) > count else "")
+
+
+def formulas_side_with_us(
+    ours: OurMap, truth: OpenDriveFormulas, waypoints: Array, road: str
+) -> NDArray[np.bool_]:
+    """Where our lanes fit the formulas at the places of these waypoints of one road."""
+    good = np.zeros(len(waypoints), bool)
+    formulas = truth.roads[road]
+    for i, (_, section, number, s, *_) in enumerate(waypoints):
+        section, number = int(section), int(number)
+        if formulas.section_at(s) != section:  # attributed to a section that does not hold there
+            section = formulas.section_at(s)
+            if (section, number) not in formulas.lane_elements:
+                good[i] = True
+                continue
+        place = formulas.lane(section, number, s)
+        pose = np.stack([place.x, place.y, place.heading], -1)
+        fit = ours.misfit([(road, number)], np.array([s]), pose, place.width)
+        good[i] = not fit.bad()[0] and fit.device[0] < DEVICE_LATERAL
+    return good
+
+
+def describe_errors(
+    waypoints: Array, names: dict[int, str], truth: OpenDriveFormulas, fit: Misfit, which: NDArray[np.bool_]
+) -> str:
+    """Waypoints in which CARLA's parser misses the formulas, in words."""
+    kinds = sorted(
+        {
+            kind
+            for road in {names[int(r)] for r in waypoints[:, 0]}
+            for kind in {g.shape.tag for g in truth.roads[road].geometries}
+        }
+    )
+    lateral = fit.lateral[which]
+    worst = f"up to {1e3 * np.nanmax(lateral):.1f} mm" if np.isfinite(lateral).any() else "on another lane"
+    return (
+        f"CARLA misses the formulas at {len(waypoints)} waypoints ({worst} across the track, up to "
+        f"{np.degrees(np.nanmax(fit.heading[which], initial=0.0)):.2f} deg, width up to "
+        f"{1e3 * np.nanmax(fit.width[which], initial=0.0):.0f} mm; ours meets them): "
+        f"{places(waypoints, names)}; geometry there: {', '.join(kinds)}"
+    )
+
+
+def compare_permissions(
+    fit: Misfit, waypoints: Array, where: Sequence[tuple[str, int]], truth: OpenDriveFormulas, row: Comparison
+) -> None:
+    """Permission to change to a neighbour that exists on our side."""
+    total, differ = 0, Counter[str]()
+    for ours, column, side in ((fit.may_left, 8, "left"), (fit.may_right, 9, "right")):
+        known = np.isfinite(ours)
+        total += int(known.sum())
+        for i in np.flatnonzero(known & (ours != waypoints[:, column])):
+            road, number = where[i]
+            mark = truth.roads[road].mark(int(waypoints[i, 1]), number, side == "left", waypoints[i, 3])
+            differ[
+                f"{'we' if ours[i] else 'CARLA'} alone allow{'' if ours[i] else 's'} it across {mark}"
+            ] += 1
+    row.figures["permission"] = {"agree": total - differ.total(), "of": total}
+    row.figures["permission"]["differ"] = dict(differ.most_common())
+
+
+def compare_formulas(ours: OurMap, truth: OpenDriveFormulas, row: Comparison) -> None:
+    """Our driving lanes at the formulas' places, and their length."""
+    lateral, headings, widths, device, lost, broken, count = [], [], [], [], [], 0, 0
+    for road in truth.roads.values():
+        for record in road.lanes:
+            length = record.s1 - record.s0
+            if record.type != "driving" or length < 0.01:
+                continue
+            n = max(2, math.ceil(length))
+            s = record.s0 + np.concatenate([[2e-3], (np.arange(n) + 0.5) / n * length, [length - 2e-3]])
+            place = road.lane(record.section, record.number, s)
+            s, pose, width = (
+                a[place.valid] for a in (s, np.stack([place.x, place.y, place.heading], -1), place.width)
+            )
+            broken += int((~place.valid).sum())
+            count += len(s)
+            if not len(s):
+                continue
+            fit = ours.misfit([(record.road, record.number)] * len(s), s, pose, width)
+            for values, found in (
+                (lateral, fit.lateral), (headings, fit.heading), (widths, fit.width), (device, fit.device)
+            ):  # fmt: skip
+                values.append(found)
+            if fit.bad().any():
+                i = np.flatnonzero(fit.bad())
+                worst = i[np.argmax(np.nan_to_num(fit.lateral[i], nan=np.inf))]
+                lost.append(
+                    f"road {record.road} section {record.section} lane {record.number} s {s[worst]:.3f}"
+                    f" ({1e3 * fit.lateral[worst]:.1f} mm, {math.degrees(fit.heading[worst]):.2f} deg,"
+                    f" width {1e3 * fit.width[worst]:.1f} mm)"
+                )
+    everything = [np.concatenate(v) if v else np.zeros(0) for v in (lateral, headings, widths, device)]
+    row.figures["formulas"] = {
+        "samples": count,
+        "host": spread(everything[0]),
+        "device": spread(everything[3]),
+        "heading_deg": float(np.degrees(np.nanmax(everything[1], initial=0.0))),
+        "width": spread(everything[2]),
+        "excluded": broken,
+    }
+    if broken:
+        row.exceptions.append(f"{broken} samples where the file's width is negative are left out")
+    if lost:
+        row.misses.append(f"formulas missed on {len(lost)} lane records, e.g. {'; '.join(lost[:3])}")
+    length = sum(lane.length for lanes in ours.lanes.values() for lane in lanes)
+    exact = truth.driving_length()
+    row.figures["driving_km"], row.figures["length_error"] = exact / 1e3, length / exact - 1 if exact else 0.0
+    published = published_lengths().get(row.map)
+    row.figures["published_km"] = published
+    if abs(length - exact) > LENGTH * exact + 1e-3:
+        row.misses.append(f"driving lanes are {length:.3f} m, by the formulas {exact:.3f} m")
+    # The published figure has two decimals.
+    if published is not None and abs(length - 1e3 * published) > LENGTH * 1e3 * published + 5.0:
+        row.misses.append(f"driving lanes are {length / 1e3:.3f} km, published {published} km")
+
+
+def published_lengths() -> dict[str, float]:
+    """Map -> driving km in the table that comes with the shared maps."""
+    readme = SHARED / "opendrive" / "README.md"
+    if not readme.is_file():
+        return {}
+    lines = [line.split("|") for line in readme.read_text(encoding="utf-8").splitlines()]
+    table = [[cell.strip() for cell in line[1:-1]] for line in lines if len(line) > 9]
+    heads = next((line for line in table if "driving km" in line), None)
+    if heads is None:
+        return {}
+    column = heads.index("driving km")
+    found = {}
+    for line in table:
+        if re.fullmatch(r"`\S+\.xodr`", line[0]) and re.fullmatch(r"[\d.]+", line[column]):
+            found[line[0].strip("`").removesuffix(".xodr")] = float(line[column])
+    return found
+
+
+def our_movements(network: Network) -> dict[str, set[tuple[LaneEnd, LaneEnd]]]:
+    """Junction -> movements of ours from driving lane over driving lanes to driving lane."""
+    found: dict[str, set[tuple[LaneEnd, LaneEnd]]] = {junction: set() for junction in network.junctions}
+    for movement in network.movements:
+        lanes = [network.lanes[i] for i in (movement.incoming, *movement.via, movement.outgoing)]
+        if all(lane.type is LaneType.DRIVING for lane in lanes):
+            ends = tuple((lane.road, lane.number) for lane in (lanes[0], lanes[-1]))
+            found.setdefault(movement.junction, set()).add((ends[0], ends[1]))
+    return found
+
+
+def carla_movements(carla_map: CarlaMap, truth: OpenDriveFormulas) -> dict[str, set[tuple[LaneEnd, LaneEnd]]]:
+    """Junction -> movements of CARLA's topology over driving lanes."""
+    names = integer_ids(truth.roads)
+    if carla_map.topology is None or names is None:
+        return {}
+    driving = {tuple(key) for key, (kind, _) in carla_map.topology["lanes"] if kind == "Driving"}
+    successors: dict[LaneKey, set[LaneKey]] = {}
+    for a, b in carla_map.topology["links"]:
+        if a != b and tuple(a) in driving and tuple(b) in driving:
+            (road, *lane), (after, *other) = a, b
+            successors.setdefault((names[road], *lane), set()).add((names[after], *other))
+    return {
+        junction: paths_across(successors, truth.roads_inside(junction)) for junction in truth.junction_ids()
+    }
+
+
+def compare_movements(ours: OurMap, carla_map: CarlaMap, truth: OpenDriveFormulas, row: Comparison) -> None:
+    """Ways across every junction: ours, CARLA's and those that the links of the file give."""
+    mine, linked = our_movements(ours.network), truth.movements()
+    row.figures["junctions"] = len(linked)
+    row.figures["movements"] = sum(map(len, mine.values()))
+    for junction in sorted(linked.keys() | mine.keys()):
+        difference(row.misses, f"junction {junction}, by the links of the file", mine, linked, junction)
+    if carla_map.topology is None:
+        return
+    theirs = carla_movements(carla_map, truth)
+    if not theirs and linked:
+        return
+    equal = 0
+    for junction in linked:
+        if mine.get(junction, set()) == theirs.get(junction, set()):
+            equal += 1
+            continue
+        settled = mine.get(junction, set()) == linked[junction]
+        into = row.exceptions if settled else row.misses
+        difference(into, f"junction {junction}, against CARLA", mine, theirs, junction)
+    row.figures["junctions_equal"] = equal
+
+
+def difference(
+    into: list[str],
+    title: str,
+    mine: dict[str, set[tuple[LaneEnd, LaneEnd]]],
+    theirs: dict[str, set[tuple[LaneEnd, LaneEnd]]],
+    junction: str,
+) -> None:
+    """Add a line on what is missing and extra, if anything is."""
+    a, b = mine.get(junction, set()), theirs.get(junction, set())
+    parts = []
+    for word, pairs in (("missing", b - a), ("extra", a - b)):
+        if pairs:
+            text = [f"{i[0]}/{i[1]} -> {o[0]}/{o[1]}" for i, o in sorted(pairs)]
+            parts.append(f"{word} {len(pairs)}: {', '.join(text[:4])}" + (", ..." if len(text) > 4 else ""))
+    if parts:
+        into.append(f"{title}: {'; '.join(parts)}")
+
+
+CARLA_LIGHT = "1000001"
+CARLA_SIGNS = {"206": SignKind.STOP, "205": SignKind.YIELD}
+
+
+def compare_marks(ours: OurMap, carla_map: CarlaMap, truth: OpenDriveFormulas, row: Comparison) -> None:
+    """Lights, stop and yield signs with the driving lanes they govern, and crosswalks."""
+    network = ours.network
+    names = integer_ids(truth.roads)
+    figures = row.figures
+
+    def governed(marks: Iterable[Any]) -> set[tuple[str, str, int]]:
+        lanes = [(mark.id, network.lanes[spot.lane]) for mark in marks for spot in mark.spots]
+        return {(id_, lane.road, lane.number) for id_, lane in lanes if lane.type is LaneType.DRIVING}
+
+    if carla_map.landmarks is not None and names is not None:
+        kinds: list[tuple[str, set[str], set[tuple[str, str, int]]]] = [
+            ("lights", {CARLA_LIGHT}, governed(network.traffic_lights))
+        ]
+        for code, kind in CARLA_SIGNS.items():
+            kinds.append((f"{kind}_signs", {code}, governed(g for g in network.signs if g.kind is kind)))
+        for name, codes, mine in kinds:
+            theirs = set()
+            for mark in carla_map.landmarks:
+                if mark["type"] in codes:
+                    road = truth.roads[names[mark["road"]]]
+                    section = road.section_at(mark["s"])
+                    for lo, hi in mark["lanes"]:
+                        theirs |= {
+                            (mark["id"], road.id, n)
+                            for (i, n) in road.lane_elements
+                            if i == section
+                            and min(lo, hi) <= n <= max(lo, hi)
+                            and road.type(i, n) == "driving"
+                        }
+            figures[name] = {
+                "equal": len(mine & theirs),
+                "missing": sorted(map(str, theirs - mine)),
+                "extra": sorted(map(str, mine - theirs)),
+                "ids": len({m[0] for m in mine}),
+                "carla_ids": len({t[0] for t in theirs}),
+            }
+    if carla_map.crosswalks is not None:
+        centers = [np.mean(p[:-1], 0) for p in closed_polygons(carla_map.crosswalks)]
+        mine = [middle(c.outline) for c in network.crosswalks]
+        near = sum(any(np.hypot(*(m - c)) < 0.1 for m in mine) for c in centers)
+        figures["crosswalks"] = {"ours": len(mine), "carla": len(centers), "same_place": near}
+        if near < len(centers):
+            row.misses.append(
+                f"{len(centers) - near} of CARLA's {len(centers)} crosswalks are not where ours are"
+            )
+
+
+def middle(outline: Array) -> Array:
+    """Mean corner of a polygon, closed or not."""
+    closed = len(outline) > 1 and np.allclose(outline[0], outline[-1])
+    return np.mean(outline[:-1] if closed else outline, 0)
+
+
+def closed_polygons(points: Sequence[tuple[float, float]]) -> Iterator[Array]:
+    """CARLA lists all corners in one sequence in which every polygon ends where it began."""
+    polygon: list[tuple[float, float]] = []
+    for x, y in points:
+        polygon.append((x, y))
+        if len(polygon) > 2 and math.hypot(x - polygon[0][0], y - polygon[0][1]) < 1e-6:
+            yield np.array(polygon)
+            polygon = []
+
+
+def compare(source: Path, network: Network, carla_map: CarlaMap) -> Comparison:
+    """All comparisons of one map."""
+    truth = OpenDriveFormulas(source)
+    row = Comparison(map=source.stem, failure=carla_map.failure, said=carla_map.said)
+    if carla_map.failure is None and integer_ids(truth.roads) is None:
+        row.failure = "casts the ids of roads to integers"
+    ours = OurMap(network)
+    compare_formulas(ours, truth, row)
+    compare_poses(ours, carla_map, truth, row)
+    compare_movements(ours, carla_map, truth, row)
+    compare_marks(ours, carla_map, truth, row)
+    return row
+
+
+# --- The table ----------------------------------------------------------------------------------------------
+
+
+def markdown(rows: Sequence[Comparison], command: str) -> str:
+    """The table and the exceptions."""
+
+    def number(value: float | None, digits: int = 2) -> str:
+        return "-" if value is None else f"{value:.{digits}f}"
+
+    heads = [
+        "map", "verdict", "waypoints", "host lateral mm (median / p99 / max)",
+        "device lateral mm (median / p99 / max)", "heading deg (max)", "width mm (max)", "outside",
+        "CARLA errs", "host to formulas mm (max)", "device to formulas mm (max)", "junctions equal",
+        "movements", "driving km", "length error %", "lane change agrees", "lights on lanes",
+        "stop / yield on lanes", "crosswalks",
+    ]  # fmt: skip
+    lines = [
+        "# Maps against CARLA's parser and against the formulas of OpenDRIVE",
+        "",
+        f"Made by `{command}`.",
+        "",
+        "Lateral: distance of CARLA's driving waypoints (every 0.5 m) from the lane of ours with the same",
+        "road, number and road coordinate, across the track. *Outside*: on no lane of ours within 5 cm.",
+        "*CARLA errs*: waypoints that miss the formulas of the standard while our lanes meet them; they are",
+        "listed below the table and left out of the figures. *To formulas*: driving lanes of ours against",
+        "direct evaluation, every metre, also where CARLA gives no answer. *Length error*: summed driving",
+        "lanes against quadrature of the formulas. Thresholds: host 1 mm, device 50 mm (median 10 mm),",
+        "heading 1 degree, width 10 mm, length 0.1 %, equal movements at every junction.",
+        "",
+        "| " + " | ".join(heads) + " |",
+        "|" + "---|" * len(heads),
+    ]
+    for row in rows:
+        f = row.figures
+        empty = {"median": None, "p99": None, "max": None}
+
+        def triple(name: str, f: dict[str, Any] = f, empty: dict[str, None] = empty) -> str:
+            return " / ".join(number(v, 3) for v in f.get(name, empty).values())
+
+        def marks(name: str, f: dict[str, Any] = f) -> str:
+            m = f.get(name)
+            if m is None:
+                return "-"
+            text = f"{m['equal']} equal"
+            return text + "".join(f", {len(m[k])} {k}" for k in ("missing", "extra") if m[k])
+
+        allowed, walks = f.get("permission"), f.get("crosswalks")
+        cells = [
+            row.map,
+            row.verdict,
+            str(f.get("waypoints", "-")),
+            triple("host"),
+            triple("device"),
+            number(f.get("heading_deg"), 3),
+            number(f.get("width", empty)["max"], 3),
+            str(f.get("outside", "-")),
+            str(f.get("carla_errs", "-")),
+            number(f["formulas"]["host"]["max"], 4),
+            number(f["formulas"]["device"]["max"], 3),
+            f"{f.get('junctions_equal', '-')} of {f['junctions']}",
+            str(f["movements"]),
+            number(f["driving_km"], 3),
+            number(100 * f["length_error"], 5),
+            "-" if not allowed else f"{allowed['agree']} of {allowed['of']}",
+            marks("lights"),
+            f"{marks('stop_signs')} / {marks('yield_signs')}",
+            "-" if not walks else f"{walks['same_place']} of {walks['carla']} ({walks['ours']} ours)",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    lines += ["", "## Differences, and what settles them", ""]
+    for row in rows:
+        notes = [f"referee fails: CARLA's parser {row.failure}"] if row.failure else []
+        notes += [f"MISS: {text}" for text in row.misses] + list(row.exceptions)
+        permission = row.figures.get("permission", {}).get("differ", {})
+        notes += [f"lane change, {count} waypoints: {text}" for text, count in permission.items()]
+        for kind in ("lights", "stop_signs", "yield_signs"):
+            for word in ("missing", "extra"):
+                listed = row.figures.get(kind, {}).get(word, [])
+                if listed:
+                    more = f" and {len(listed) - 4} more" if len(listed) > 4 else ""
+                    title = kind.replace("_", " ")
+                    notes.append(
+                        f"{title} {word} against CARLA (id, road, lane): {' '.join(listed[:4])}{more}"
+                    )
+        notes += [f"CARLA prints: {line}" for line in dict.fromkeys(row.said)]
+        if notes:
+            lines += [f"**{row.map}**", "", *(f"- {note}" for note in notes), ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def map_files(given: Sequence[Path]) -> list[Path]:
+    """The .xodr files named, or in the folders named."""
+    found = [f for path in given for f in (sorted(path.glob("*.xodr")) if path.is_dir() else [path])]
+    return list(dict.fromkeys(found))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare maps, write the table, return 1 if any map misses a threshold."""
+    from limsim_jax.maps.opendrive import read_opendrive
+
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--maps", nargs="+", type=Path, default=[SHARED / "opendrive", REPO / "maps"])
+    parser.add_argument("--json", type=Path, default=RESULTS / "maps_against_carla.json")
+    parser.add_argument("--markdown", type=Path, default=RESULTS / "maps_against_carla.md")
+    parser.add_argument("--timeout", type=float, default=120.0, help="seconds for CARLA's parser per map")
+    options = parser.parse_args(arguments)
+    rows = []
+    for source in map_files(options.maps):
+        start = time.perf_counter()
+        rows.append(compare(source, read_opendrive(source), ask_carla(source, options.timeout)))
+        print(f"{rows[-1].verdict:14} {source.name} ({time.perf_counter() - start:.1f} s)", flush=True)
+        for text in rows[-1].misses:
+            print(f"    {text}", flush=True)
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    command = " ".join(["python experiments/maps_against_carla.py", *given])
+    options.markdown.parent.mkdir(parents=True, exist_ok=True)
+    options.markdown.write_text(markdown(rows, command), encoding="utf-8")
+    options.json.parent.mkdir(parents=True, exist_ok=True)
+    table = [{**vars(row), "verdict": row.verdict} for row in rows]
+    options.json.write_text(
+        json.dumps({"command": command, "maps": table}, indent=1) + "\n", encoding="utf-8"
+    )
+    return int(any(row.misses for row in rows))
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--answer"]:
+        _answer(Path(sys.argv[2]), Path(sys.argv[3]))
+        sys.exit(0)
+    sys.exit(main())
