@@ -26,16 +26,20 @@ class Cubics:
         self.s: Float[Array, " R"] = table[:, 0]
         self.coefficients: Float[Array, "R 4"] = table[:, 1:]
 
-    def __call__(self, s: Array, at: Array, derivative: int = 0) -> Array:
-        """Value (or derivative) at `s`; before the first record that record is extended backwards."""
-        i = np.clip(np.searchsorted(self.s, at, side="right") - 1, 0, None)
-        a, b, c, d = self.coefficients[i].T
-        u = s - self.s[i]
-        if derivative == 0:
-            return a + u * (b + u * (c + u * d))
-        if derivative == 1:
-            return b + u * (2 * c + u * 3 * d)
-        return 2 * c + 6 * d * u
+    def _local(self, s: Array, at: Array) -> tuple[Array, Array]:
+        i = np.maximum(np.searchsorted(self.s, at, side="right") - 1, 0)
+        return self.coefficients[i].T, s - self.s[i]
+
+    def __call__(self, s: Array, at: Array) -> Array:
+        """Values at `s`; before the first record that record is extended backwards."""
+        (a, b, c, d), u = self._local(s, at)
+        return a + u * (b + u * (c + u * d))
+
+    def jet(self, s: Array, at: Array) -> Float[Array, "3 M"]:
+        """Values and first two derivatives at `s`."""
+        (a, b, c, d), u = self._local(s, at)
+        ud = u * d
+        return np.stack([a + u * (b + u * (c + ud)), b + u * (2 * c + 3 * ud), 2 * c + 6 * ud])
 
     @property
     def constant(self) -> bool:
@@ -103,7 +107,7 @@ class ReferenceLine:
         self._panels = min(int(turn) + 1, 1024)
 
     def _index(self, at: Array) -> NDArray[np.int64]:
-        return np.clip(np.searchsorted(self.s, at, side="right") - 1, 0, None)
+        return np.maximum(np.searchsorted(self.s, at, side="right") - 1, 0)
 
     def frame(self, s: Array, at: Array) -> tuple[Array, Array, Array, Array, Array]:
         """`x, y, heading, curvature, d(curvature)/ds` at `s`."""

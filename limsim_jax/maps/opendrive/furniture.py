@@ -350,7 +350,14 @@ class Furnisher:
     def _spans(self, outline: Array, z: float) -> list[tuple[str, float, float]]:
         spans = []
         for lane in self._near(outline.min(0), outline.max(0), z):
-            s = np.linspace(0.0, lane.length, max(2, int(lane.length / 0.05) + 1))
+            # only the stretch within reach of the outline, from the samples of the lane
+            centre, reach = outline.mean(0), float(np.hypot(*np.ptp(outline, axis=0)))
+            step = np.diff(lane.s, append=lane.length).max()
+            near = np.hypot(*(lane.xyz[:, :2] - centre).T) <= reach + step
+            if not near.any():
+                continue
+            low, high = lane.s[near][[0, -1]] + np.array([-step, step])
+            s = np.clip(np.arange(low, high + 0.05, 0.05), 0.0, lane.length)
             inside = inside_polygon(lane.pose(s)[0][:, :2], outline)
             if inside.any():
                 where = np.nonzero(inside)[0]
@@ -384,6 +391,42 @@ def speed_value(signal: RawSignal) -> float | None:
         # catalogue until 2017: 274-51 is 10 km/h, 274-63 is 130 km/h; since then the number is the speed
         return (number - 50) * 10 / 3.6 if 51 <= number <= 63 else number / 3.6 if number > 0 else None
     return None
+
+
+def extend_lights(
+    lights: list[TrafficLight], movements: tuple[Movement, ...], lanes: dict[str, Lane], report: ImportReport
+) -> list[TrafficLight]:
+    """A light that the file gives to some movements of a lane holds for the others of that lane too.
+
+    Who waits at a red light does not know which connecting road the file forgot. Movements that no
+    light names, from a lane of which another movement is named, are added and reported.
+    """
+    own: dict[str, dict[int, None]] = defaultdict(dict)  # lane -> lights that name it
+    for i, light in enumerate(lights):
+        for spot in light.spots:
+            own[spot.lane][i] = None
+    added: dict[int, dict[str, None]] = defaultdict(dict)
+    by_lane: dict[str, list[Movement]] = defaultdict(list)
+    for m in movements:
+        by_lane[m.incoming].append(m)
+    for name, members in by_lane.items():
+        if name in own:
+            continue
+        named = {i: None for m in members for via in m.via for i in own.get(via, ())}
+        for m in members:
+            if named and m.via and not any(via in own for via in m.via):
+                added[next(iter(named))][m.via[0]] = None
+    result = list(lights)
+    for i, vias in added.items():
+        light = lights[i]
+        report.repaired(
+            "traffic light",
+            light.id,
+            f"named for other movements of the same lanes only: extended to {', '.join(vias)}",
+            light.line,
+        )
+        result[i] = replace(light, spots=light.spots + tuple(LaneSpot(lane=v, s=0.0) for v in vias))
+    return result
 
 
 def regulate(

@@ -124,7 +124,7 @@ class RoadShape:
 
     def profile(self, section: RawSection, s: Array, at: Array) -> dict[int, tuple[Array, Array]]:
         """Per lane number: centre offset t with its first two derivatives `[3, M]`, and width `[M]`."""
-        offset = np.stack([self.road.offset(s, at, k) for k in range(3)])
+        offset = self.road.offset.jet(s, at)
         result: dict[int, tuple[Array, Array]] = {}
         local, local_at = s - section.s, at - section.s
         for side in (1, -1):
@@ -153,9 +153,9 @@ class RoadShape:
 def _width(lane: RawLane, side: int, inner: Array, s: Array, at: Array) -> Array:
     """Width and its first two derivatives `[3, M]`; never below zero. `inner` is relative to lane 0."""
     if lane.width is not None:
-        width = np.stack([lane.width(s, at, k) for k in range(3)])
+        width = lane.width.jet(s, at)
     elif lane.border is not None:
-        width = side * (np.stack([lane.border(s, at, k) for k in range(3)]) - inner)
+        width = side * (lane.border.jet(s, at) - inner)
     else:
         width = np.zeros((3, len(s)))
     return np.where(width[0] > 0, width, 0.0)
@@ -170,6 +170,7 @@ class Cutter:
     def __init__(self, report: ImportReport) -> None:
         self.report = report
         self.piece_at: dict[tuple[str, int], list[Piece]] = {}  # (road, section index) -> pieces, ascending
+        self._wide: dict[tuple[str, int | None, float], list[int]] = {}
 
     def pieces(self, road: RawRoad, extra: set[float]) -> list[Piece]:
         """The pieces of a road, ascending in s. `extra` are places where it has to be cut."""
@@ -289,9 +290,7 @@ class Cutter:
         numbers = sorted(n for n in section.lanes if n != 0)
         types = {n: self._type(road, section.lanes[n]) for n in numbers}
         forward = {n: _forward(road, section.lanes[n]) for n in numbers}
-        at = np.array([s])
-        profile = shape.profile(section, at, at)
-        real = [n for n in numbers if profile[n][1][0] >= MIN_WIDTH or _ever_wide(shape, section, n)]
+        real = self._real(road.id, shape, section, numbers)
         result = {}
         for n in numbers:
             up = down = False
@@ -312,6 +311,17 @@ class Cutter:
                 change_down=down,
             )
         return result
+
+    def _real(
+        self, road: str, shape: RoadShape, section: RawSection, numbers: list[int]
+    ) -> list[int]:
+        """The lanes of a section that somewhere have a width."""
+        key = (road, section.line, section.s)
+        if key not in self._wide:
+            s = np.linspace(section.s, max(section.end, section.s), 17)
+            profile = shape.profile(section, s, s)
+            self._wide[key] = [n for n in numbers if profile[n][1].max() >= MIN_WIDTH]
+        return self._wide[key]
 
     def _type(self, road: RawRoad, lane: RawLane) -> LaneType:
         known = _TYPES.get(lane.type.lower())
@@ -399,12 +409,6 @@ def _changes(lane: RawLane) -> list[float]:
 def _forward(road: RawRoad, lane: RawLane) -> bool:
     forward = (lane.id < 0) != road.left_hand
     return not forward if lane.forward_sign == 1 else forward
-
-
-def _ever_wide(shape: RoadShape, section: RawSection, number: int) -> bool:
-    end = max(section.end, section.s)
-    s = np.linspace(section.s, end, 17)
-    return bool(shape.profile(section, s, s)[number][1].max() >= MIN_WIDTH)
 
 
 def _may_mix(types: dict[int, LaneType], forward: dict[int, bool], a: int, b: int) -> bool:

@@ -10,8 +10,9 @@ from typing import TypeVar
 
 import numpy as np
 
+from limsim_jax.maps.check import GAP, KINK, seams
 from limsim_jax.maps.network import ImportReport, Lane, MapError, Network, Road
-from limsim_jax.maps.opendrive.furniture import Furnisher, regulate
+from limsim_jax.maps.opendrive.furniture import Furnisher, extend_lights, regulate
 from limsim_jax.maps.opendrive.lanes import Cutter, Piece, lane_id, sample_piece
 from limsim_jax.maps.opendrive.links import Linker, build_movements
 from limsim_jax.maps.opendrive.records import (
@@ -23,8 +24,6 @@ from limsim_jax.maps.opendrive.records import (
 from limsim_jax.maps.xml import Reader, file_hash, read_bytes, top_level
 
 LARGEST = 1e8  # m, coordinates beyond this are not on Earth
-GAP = 0.01  # m
-KINK = np.radians(0.5)
 
 T = TypeVar("T", RawRoad, RawJunction, RawController)
 
@@ -100,8 +99,8 @@ def read_opendrive(path: str | Path) -> Network:
     _connector_speeds(lanes, pieces, roads, report)
     movements, junction_records = build_movements(lanes, junctions, linker.through, report)
     furniture = Furnisher(roads, pieces, lanes, movements, controllers, report).run()
+    furniture.lights = extend_lights(furniture.lights, movements, lanes, report)
     movements = regulate(movements, lanes, furniture.lights, furniture.signs, report)
-    _report_gaps(lanes, report)
     parser.ignored.report(report)
     network = Network(
         name=name or path.name.partition(".")[0],
@@ -130,6 +129,12 @@ def read_opendrive(path: str | Path) -> Network:
         crosswalks=tuple(furniture.crosswalks),
         report=report,
     )
+    for seam in seams(network):  # positions stay as the file has them
+        report.approximated(
+            "lane link",
+            f"{seam.before} to {seam.after}",
+            f"the lanes meet {seam.gap:.3f} m apart and at {np.degrees(abs(seam.kink)):.2f} degrees: kept so",
+        )
     return network
 
 
@@ -214,25 +219,6 @@ def _report_road(road: RawRoad, pieces: list[Piece], report: ImportReport) -> No
             )
     if not pieces:
         report.repaired("road", where, "all its lane sections are empty or too short: no lanes", road.line)
-
-
-def _report_gaps(lanes: dict[str, Lane], report: ImportReport) -> None:
-    """Name links between lanes that do not meet; positions stay as the file has them."""
-    for lane in lanes.values():
-        if not lane.drivable:
-            continue
-        for name in lane.successors:
-            other = lanes[name]
-            if not other.drivable:
-                continue
-            gap = float(np.hypot(*(other.xyz[0, :2] - lane.xyz[-1, :2])))
-            kink = abs(float(np.angle(np.exp(1j * (other.heading[0] - lane.heading[-1])))))
-            if gap > GAP or kink > KINK:
-                report.approximated(
-                    "lane link",
-                    f"{lane.id} to {name}",
-                    f"the lanes meet {gap:.3f} m apart and at {np.degrees(kink):.2f} degrees: kept so",
-                )
 
 
 def _connector_speeds(
