@@ -74,8 +74,6 @@ class ConflictTable:
     connector: Int[Array, " L"]  # connector of each lane row, -1 for other lanes and the null lane
     movement: Int[Array, " K"]  # the movement through the connector; -1 if there is none or several
     length: Float[Array, " K"]  # m
-    turn_speed: Float[Array, " K"]  # m/s, sqrt(5.5 m/s2 x smallest radius), at most the speed limit
-    stop_s: Float[Array, " K"]  # m, stop line; negative: on the lane before; 0 without one
     wait_s: Float[Array, " K"]  # m from here along the movement, where to wait for foes inside; 0: nowhere
     clear_s: Float[Array, " K"]  # m, end of the last crossing or merging stretch; 0 without any
     foe: Int[Array, "K C"]  # connector
@@ -103,7 +101,7 @@ class ConflictTable:
             return out
 
         fills = {"foe": -1, "lane": -1, "connector": -1, "movement": -1, "length": 1.0}
-        fills |= dict.fromkeys(("s_in", "s_out", "f_in", "f_out", "turn_speed"), ABSENT)
+        fills |= dict.fromkeys(("s_in", "s_out", "f_in", "f_out"), ABSENT)
         return ConflictTable(
             **{
                 name: null_last(x, lanes if name == "connector" else connectors, fills.get(name, 0))
@@ -229,8 +227,6 @@ def build_conflicts(
         connector=connector,
         movement=movement,
         length=np.array([lane.length for lane in lanes] + [1.0], np.float32),
-        turn_speed=np.array([_turn_speed(lane) for lane in lanes] + [ABSENT], np.float32),
-        stop_s=np.array([*_stop_positions(network, lanes, entries), 0.0], np.float32),
         wait_s=np.array([*_waiting_points(network, lanes, entries, right_of_way), 0.0], np.float32),
         clear_s=clear_s,
         **floats,
@@ -390,9 +386,9 @@ class _Curves:
         at_end = (inside + step < 0) | (inside + step >= np.diff(start)[curve])
         i = start[curve] + inside
         o = np.where(at_end, i, i + step)
-        # One sample more on both sides: what is nearest to the sample outside may lie just beyond.
-        lo = start[other] + np.maximum(lo - 1, 0)
-        hi = np.minimum(start[other] + hi + 1, start[other + 1] - 1)
+        # Some samples more on both sides: what is nearest to the sample outside may lie just beyond.
+        lo = start[other] + np.maximum(lo - 3, 0)
+        hi = np.minimum(start[other] + hi + 3, start[other + 1] - 1)
         d_in, d_out = (_distance_to_curve(xyz, point, lo, hi) for point in (i, o))
         with np.errstate(divide="ignore", invalid="ignore"):
             u = np.clip((reach - d_in) / (d_out - d_in), 0.0, 1.0)
@@ -817,42 +813,7 @@ def _break_cycles(ends: NDArray[np.int_], prio: NDArray[np.int_], rule: NDArray[
     return prio
 
 
-# --- where to stop, how fast to turn ----------------------------------------------------------
-
-
-def _turn_speed(lane: Lane, *, lateral: float = 5.5, window: float = 4.0) -> float:
-    """Speed (m/s) at which the sharpest bend of a lane takes a lateral acceleration of 5.5 m/s2.
-
-    The curvature is the mean over 4 m, so that the kinks of polylines count as the bends they stand
-    for. The limit is that of SUMO's `junctions.limit-turn-speed`.
-    """
-    s = np.linspace(0, lane.length, max(2, math.ceil(lane.length / _STEP) + 1))
-    heading = np.interp(s, lane.s, lane.heading)
-    n = min(len(s) - 1, max(1, round(window / (s[1] - s[0]))))
-    bend = np.abs(heading[n:] - heading[:-n]).max() / (s[n] - s[0])
-    return min(lane.speed_limit, math.sqrt(lateral / max(bend, 1e-6)))
-
-
-def _stop_positions(
-    network: Network, lanes: Sequence[Lane], entries: Sequence[Sequence[tuple[Overlap, int, int]]]
-) -> Iterator[float]:
-    """Arc length (m) of the stop line: up to 30 m before the connector, or on it before all conflicts."""
-    spots: dict[str, list[float]] = defaultdict(list)
-    for line in network.stop_lines:
-        spots[line.spot.lane].append(line.spot.s)
-    for lane, row in zip(lanes, entries, strict=True):
-        if lane.junction is None:
-            yield 0.0
-            continue
-        first = min([o.s_in for o, _, _ in row if o.type is not ConflictType.DIVERGE], default=lane.length)
-        before = [
-            s - network.lanes[name].length
-            for name in lane.predecessors
-            if network.lanes[name].junction is None
-            for s in spots[name]
-            if network.lanes[name].length - s <= 30.0
-        ]
-        yield min([*before, *(s for s in spots[lane.id] if s <= first)], default=0.0)
+# --- where to wait ----------------------------------------------------------------------------
 
 
 def _waiting_points(

@@ -565,25 +565,24 @@ class _Painter:
 
     def conflicts(self) -> None:
         """Stretches of connectors where paths cross, merge or part (`conflicts.build_conflicts`)."""
-        from limsim_jax.maps.conflicts import build_conflicts
+        from limsim_jax.maps.conflicts import ConflictType, build_conflicts
         from limsim_jax.maps.lane_map import lane_rows
 
         rows = lane_rows(self.network)
         ids = list(rows)
         table = build_conflicts(self.network, rows)
-        zones = _conflict_zones(table)
         top = max(self.levels.values(), default=0)
-        for order, (name, color) in enumerate(_CONFLICTS.items()):
+        for order, (kind, color) in enumerate(_CONFLICTS.items()):
+            found = np.argwhere(np.asarray(table.type) == ConflictType[kind.upper()])
             stretches = [
-                shape.stretch(s_in, s_out)
-                for row, kind, s_in, s_out in zones
-                if kind == name and (shape := self.shapes.get(ids[row])) is not None
+                shape.stretch(float(table.s_in[k, c]), float(table.s_out[k, c]))
+                for k, c in found
+                if (shape := self.shapes.get(ids[int(table.lane[k])])) is not None
             ]
-            self.areas(
-                "conflicts", stretches, top + 0.63 + 0.01 * order, facecolors=color, alpha=0.35, linewidths=0
-            )
+            zorder = top + 0.63 + 0.01 * order
+            self.areas("conflicts", stretches, zorder, facecolors=color, alpha=0.35, linewidths=0)
             if stretches:
-                self.legend[f"conflict: {name}"] = {"area": color, "alpha": 0.6}
+                self.legend[f"conflict: {kind}"] = {"area": color, "alpha": 0.6}
 
     def labels(self) -> None:
         """Ids of roads along them and of junctions on them, each where it finds room."""
@@ -637,11 +636,6 @@ class _Painter:
         xy = np.asarray(places, float)
         style = {"linewidths": 0.12 * size, **style}
         self.keep(layer, self.ax.scatter(xy[:, 0], xy[:, 1], s=size**2, **style), zorder)
-
-
-def _conflict_zones(table: Any) -> list[tuple[int, str, float, float]]:
-    """(row, kind, s_in, s_out) of every entry of a `ConflictTable`, without the padding."""
-    raise NotImplementedError
 
 
 def _prepare(network: Network) -> tuple[dict[str, _Shape], dict[str, int]]:
@@ -799,7 +793,7 @@ def draw_map(
         size: width and height of the page in inches; chosen from the map if not given.
 
     Raises:
-        MapError: unknown suffix, folder that does not exist, a map without lanes, or useless `bounds`.
+        MapError: unknown suffix, file that cannot be written, a map without lanes, or useless `bounds`.
         ModuleNotFoundError: matplotlib is not installed.
     """
     target = None if path is None else _checked_target(path)
@@ -866,8 +860,6 @@ def _checked_target(path: str | Path) -> Path:
     if target.suffix.lower() not in SUFFIXES:
         known = ", ".join(SUFFIXES)
         raise MapError(f"cannot draw to '{target.suffix or target.name}': use one of {known}", file=target)
-    if not target.parent.is_dir():
-        raise MapError(f"folder {target.parent} does not exist", file=target)
     return target
 
 

@@ -79,7 +79,8 @@ class ImportReport:
 
     def read(self, element: str, count: int = 1) -> None:
         """Count elements that were taken over exactly."""
-        self.counts[element, Action.READ] += count
+        if count:
+            self.counts[element, Action.READ] += count
 
     def approximated(self, element: str, where: str, message: str, line: int | None = None) -> None:
         """Record an element that was taken over, but not exactly."""
@@ -345,6 +346,7 @@ class TrafficLight:
     position: tuple[float, float, float]  # m
     heading: float  # rad, direction of the traffic that looks at it
     spots: tuple[LaneSpot, ...] = ()  # lanes governed, and where its head stands along them
+    turns: tuple[Turn, ...] = ()  # arrow lights: the turns governed; empty: all
     controller: str | None = None
     line: int | None = None
 

@@ -553,10 +553,11 @@ def _end_heading(segment: float, given: float | None, turn: Float[Array, " J"]) 
 
 def distance_to_polyline(xy: Float[Array, "M 2"], points: Float[Array, "K 2"]) -> Float[Array, " M"]:
     """Distance (m) of each point from the nearest place on a polyline."""
-    start, chord = points[:-1], np.diff(points, axis=0)
-    offset = xy[:, None] - start
-    u = np.clip((offset * chord).sum(-1) / np.maximum((chord**2).sum(-1), 1e-300), 0.0, 1.0)
-    return np.linalg.norm(offset - u[..., None] * chord, axis=-1).min(1)
+    p, vertices = xy @ (1, 1j), points @ (1, 1j)
+    start, chord = vertices[:-1], np.diff(vertices)
+    offset = p[:, None] - start
+    u = (offset * (chord.conj() / np.maximum(np.abs(chord) ** 2, 1e-300))).real
+    return np.abs(offset - np.clip(u, 0.0, 1.0) * chord).min(1)
 
 
 # -------------------------------------------------------------------------------------------- reader
@@ -754,9 +755,11 @@ class _Reader:
                 self._lane(child, edge, offset)
         if not edge.lanes:
             raise xml.error(element, "the edge has no lanes")
-        edge.lanes.sort(key=lambda lane: lane.index)
-        if [lane.index for lane in edge.lanes] != list(range(len(edge.lanes))):
-            raise xml.error(element, "lane indices are not 0, 1, 2, ...")
+        for position, lane in enumerate(edge.lanes):  # SUMO goes by the order; netconvert has written wrong ones
+            if lane.index != position:
+                message = f"index {lane.index} taken as {position}, its place in the edge"
+                self.report.repaired("lane", lane.id, message, lane.element.sourceline)
+                lane.index = position
         self._ignore_children(element, "lane", "stopOffset")
         self._done(element, count=not bidi)
 
@@ -808,7 +811,7 @@ class _Reader:
         self._ignore_children(element, "neigh", "stopOffset")
         edge.lanes.append(lane)
         self.lanes[lane.id] = lane
-        self._done(element)
+        self._done(element, count=False)
 
     def _lane_of(self, element: Any, edge_name: str, lane_name: str) -> _Lane:
         edge = self.edges.get(self.xml.text(element, edge_name))
@@ -938,6 +941,8 @@ class _Reader:
         programs = self._programs(movements)
         stop_lines, lights = self._stop_positions(movements, lanes)
         crosswalks = self._crosswalks(lanes)
+        noted = {note.where for note in self.report.notes if note.element == "lane"}
+        self.report.read("lane", len(lanes) - len(noted))
         self.xml.summarise()
         path = Path(self.xml.path)
         return Network(
@@ -1136,6 +1141,7 @@ class _Reader:
                     deviation, where = curve.deviation, lanes[0].id
                 worst[kind] = deviation, count + len(lanes), where
 
+        self._compare_lengths()
         for lane in self.lanes.values():
             lane.points = self._clean(lane)
         for lane in self.lanes.values():
@@ -1178,6 +1184,29 @@ class _Reader:
             self.report.approximated("shape", f"{kind} lanes", message)
         return curves
 
+    def _compare_lengths(self) -> None:
+        """Report declared lengths that differ from those of the shapes by more than 1 % and 0.1 m.
+
+        The lanes of an edge share one length: netconvert writes the mean of their shapes.
+        """
+        parallel: list[tuple[float, str]] = []
+        for edge in self.edges.values():
+            if edge.function == "walkingarea":
+                continue
+            sizes = [float(np.linalg.norm(np.diff(lane.points, axis=0), axis=1).sum()) for lane in edge.lanes]
+            mean = sum(sizes) / len(sizes)
+            for lane, size in zip(edge.lanes, sizes, strict=True):
+                limit = max(0.01 * lane.length, 0.1)
+                if abs(mean - lane.length) > limit:
+                    message = f"declared length {lane.length:.2f} m, but the shape is {size:.2f} m long"
+                    self.report.approximated("lane@length", lane.id, message, lane.element.sourceline)
+                elif abs(size - lane.length) > limit:
+                    parallel.append((abs(size - lane.length), lane.id))
+        if parallel:
+            worst, where = max(parallel)
+            message = f"{len(parallel)} lanes in bends differ from the length of their edge by up to {worst:.2f} m"
+            self.report.approximated("lane@length", f"lane {where}", message)
+
     def _clean(self, lane: _Lane) -> Float[Array, "K 3"]:
         """The shape without repeated points; a shape without extent becomes 1 cm long."""
         line = lane.element.sourceline
@@ -1187,10 +1216,6 @@ class _Reader:
         if np.abs(points).max() > 1e9:
             raise self.xml.error(lane.element, "the shape lies more than 1e9 m away")
         size = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        declared = lane.length
-        if abs(size.sum() - declared) > max(0.01 * declared, 0.1) and lane.edge.function != "walkingarea":
-            message = f"the shape is {size.sum():.2f} m long, the declared length {declared:.2f} m"
-            self.report.approximated("lane", lane.id, message, line)
         step = np.hypot(*np.diff(points[:, :2], axis=0).T)
         keep = np.append(True, step > 1e-6)
         if not keep.all():
@@ -1276,8 +1301,6 @@ class _Reader:
                 )
             outline = self.xml.shape(element, "shape")
             self.xml.number(element, "z", 0.0)
-            self._ignore_children(element, "request")
-            self._done(element)
             junctions[junction] = Junction(
                 id=junction,
                 name=self.xml.text(element, "name", ""),
@@ -1288,6 +1311,8 @@ class _Reader:
                 outline=tuple((float(x), float(y)) for x, y, _ in outline),
                 roundabout=junction in self.roundabouts,
             )
+            self._ignore_children(element, "request")
+            self._done(element)
         self._count_left_out(links)
         return tuple(movements), junctions
 

@@ -20,6 +20,7 @@ from limsim_jax.maps.network import (
     SignKind,
     StopLine,
     TrafficLight,
+    Turn,
 )
 from limsim_jax.maps.opendrive.curves import Array
 from limsim_jax.maps.opendrive.lanes import Piece, RoadShape, lane_id
@@ -41,6 +42,18 @@ OTHER_LIGHTS = {
     "1000015": "pedestrians and cyclists",
     "1000017": "trams",
     "1000018": "trams",
+}
+# arrows on lights, by subtype
+_LEFT, _RIGHT = (Turn.LEFT, Turn.SLIGHT_LEFT, Turn.U_TURN), (Turn.RIGHT, Turn.SLIGHT_RIGHT)
+_AHEAD = (Turn.STRAIGHT, Turn.SLIGHT_LEFT, Turn.SLIGHT_RIGHT)
+ARROWS = {
+    ("1000011", "10"): _LEFT,
+    ("1000011", "20"): _RIGHT,
+    ("1000011", "30"): _AHEAD,
+    ("1000011", "40"): _AHEAD + _LEFT,
+    ("1000011", "50"): _AHEAD + _RIGHT,
+    ("1000012", "10"): _LEFT,
+    ("1000012", "20"): _RIGHT,
 }
 # road signs by country, "type" or "type-subtype"; the catalogue of OpenDRIVE itself numbers as Germany does
 _GERMAN = {
@@ -174,6 +187,7 @@ class Furnisher:
                     position=position,
                     heading=float(facing),
                     spots=tuple(spots),
+                    turns=ARROWS.get((signal.type, signal.subtype), ()),
                     controller=self.controller_of.get(signal.id),
                     line=signal.line,
                 )
@@ -453,10 +467,13 @@ def regulate(
     things += [(f"{sign.kind} sign", sign, meaning[sign.kind]) for sign in signs if sign.kind in meaning]
     for element, thing, new in things:
         reached: set[int] = set()
+        turns = thing.turns if isinstance(thing, TrafficLight) else ()
         for spot in thing.spots:
             name = downstream(spot, lanes, entry)
-            reached.update(entry[name] if name is not None else ())
-        if thing.spots and not reached and new is not Control.PRIORITY:
+            for m in entry[name] if name is not None else ():
+                if not turns or movements[m].turn in turns:
+                    reached.add(m)
+        if thing.spots and not reached and not turns and new is not Control.PRIORITY:
             report.approximated(
                 element,
                 thing.id,
