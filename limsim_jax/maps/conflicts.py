@@ -390,11 +390,12 @@ class _Curves:
         lo = start[other] + np.maximum(lo - 3, 0)
         hi = np.minimum(start[other] + hi + 3, start[other + 1] - 1)
         d_in, d_out = (_distance_to_curve(xyz, point, lo, hi) for point in (i, o))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = np.clip((reach - d_in) / (d_out - d_in), 0.0, 1.0)
-        # A bridge may end a stretch: then the sample inside is its end.
-        u = np.where(at_end | ~(d_out > reach), 0.0, u)
-        return (s[i] + u * (s[o] - s[i])).reshape(-1, 4)
+        # Chords may be a little closer than samples: then the end lies beyond the sample outside. If
+        # that is much too close, a bridge has ended the stretch.
+        away = ~at_end & (d_out > d_in) & (d_out > reach - 0.01)
+        u = np.clip((reach - d_in) / np.where(away, d_out - d_in, np.inf), 0.0, 2.0)
+        ends = s[i] + u * (s[o] - s[i])
+        return np.clip(ends, s[start[curve]], s[start[curve + 1] - 1]).reshape(-1, 4)
 
 
 def _distance_to_curve(
@@ -719,13 +720,13 @@ def _turn_rank(path: _Path, opposing: bool) -> int:
 
 
 def ring_lanes(
-    network: Network, lanes: Sequence[Lane], *, longest: float = 600.0, uneven: float = 0.6
+    network: Network, lanes: Sequence[Lane], *, longest: float = 600.0, uneven: float = 0.35
 ) -> set[str]:
     """Ids of the lanes that circulate in a roundabout, as far as they lie on a ring with one of `lanes`.
 
     The shortest way from such a lane back to itself must be at most `longest` (m), turn once to the left
-    (to the right with left-hand traffic), and its heading must stay within `uneven` (rad) of a circle
-    driven at constant speed. Going round a rectangular block with sharp corners deviates by pi/4.
+    (to the right with left-hand traffic), and its heading must stay within `uneven` (rad) of that on a
+    circle. Roundabouts stay below 0.15; a square with sharp corners is off by pi/4, an octagon by pi/8.
     """
     everything = list(network.drivable_lanes())
     row = {lane.id: i for i, lane in enumerate(everything)}
