@@ -62,7 +62,7 @@ VEHICLE_CLASSES = frozenset(
 )
 """Abstract vehicle classes of SUMO 1.28."""
 
-_OLD_CLASSES = {
+OLD_CLASSES = {
     "public_emergency": "emergency",
     "public_authority": "authority",
     "public_army": "army",
@@ -72,6 +72,7 @@ _OLD_CLASSES = {
     "cityrail": "rail_urban",
     "rail_slow": "rail",
 }
+"""Names of vehicle classes in nets of old versions."""
 
 ENGINE_CLASS = {
     "passenger": "car",
@@ -713,7 +714,7 @@ class _Reader:
         def names(value: str) -> set[str]:
             found = set()
             for name in re.split(r"[\s|]+", value.strip()):
-                name = _OLD_CLASSES.get(name, name)
+                name = OLD_CLASSES.get(name, name)
                 if name == "all":
                     return set(VEHICLE_CLASSES)
                 if name in VEHICLE_CLASSES:
