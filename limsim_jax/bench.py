@@ -225,6 +225,7 @@ def _time(function: Callable[..., Any], repeats: int, *arguments: Any) -> dict[s
     """Compile time, and the median run time of a call once it is compiled."""
     import jax
 
+    jax.clear_caches()
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*arguments).compile()
     compile_s = time.perf_counter() - start

@@ -5,6 +5,7 @@ A user's error is one line on stderr and exit code 2. A bug is a traceback.
 
 from __future__ import annotations
 
+import copy
 import json
 import sys
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ import typer
 from limsim_jax import __version__
 
 if TYPE_CHECKING:
-    from limsim_jax.maps.network import Network
+    from limsim_jax.maps.network import ImportReport, Network
 
 app = typer.Typer(
     help="Road traffic for validating automated driving.",
@@ -87,7 +88,7 @@ def info(file: MapArgument, json_file: JsonOption = None, no_cache: NoCacheOptio
     network = _load(file, no_cache)
     facts = _facts(network)
     if json_file is not None:
-        _write_json(json_file, facts | {"report": _report(network)})
+        _write_json(json_file, facts | {"report": _report(network.report)})
     width = max(map(len, facts)) + 2
     for name, value in facts.items():
         print(f"{name.replace('_', ' '):<{width}}{_say(value)}")
@@ -123,19 +124,22 @@ def check(
     json_file: JsonOption = None,
     no_cache: NoCacheOption = False,
 ) -> int:
-    """Say whether a map can be trusted: exit code 0 if it is clean, 1 if not, 2 if it cannot be read.
+    """Say whether a map can be trusted: exit code 0 if it is clean, 1 if not, 2 if it cannot be used.
 
-    Findings are what the reader had to repair and links at which the centre line jumps by more than
-    1 cm or 0.5 degrees. With --strict, what was approximated or ignored is a finding as well.
+    Findings are what the reader had to repair, links at which the centre line jumps by more than 1 cm
+    or 0.5 degrees, and circles of lanes each of which yields to the next. With --strict, what was
+    approximated or ignored is a finding as well.
     """
-    from limsim_jax.maps.check import seams
+    from limsim_jax.maps import build_lane_map
+    from limsim_jax.maps.check import deadlocks, seams
     from limsim_jax.maps.network import Action
 
     network = _load(file, no_cache)
-    report = network.report
-    broken = list(seams(network))
+    report = copy.deepcopy(network.report)
+    build_lane_map(network, report=report, cache=not no_cache)
+    broken, circles = list(seams(network)), deadlocks(network)
     counted = {Action.REPAIRED} | ({Action.APPROXIMATED, Action.IGNORED} if strict else set())
-    findings = len(broken) + sum(report.total(action) for action in counted)
+    findings = len(broken) + len(circles) + sum(report.total(action) for action in counted)
     if json_file is not None:
         _write_json(
             json_file,
@@ -145,7 +149,8 @@ def check(
                 "strict": strict,
                 "findings": findings,
                 "seams": [vars(seam) for seam in broken],
-                "report": _report(network),
+                "deadlocks": circles,
+                "report": _report(report),
             },
         )
     print(report)
@@ -153,6 +158,8 @@ def check(
         print(note)
     for seam in broken:
         print(f"{'seam':<12} {seam}")
+    for circle in circles:
+        print(f"{'deadlock':<12} each yields to the next: {', '.join(circle)}")
     print(f"{network.source}: {findings or 'no'} finding{'' if findings == 1 else 's'}")
     return 1 if findings else 0
 
@@ -161,7 +168,7 @@ def check(
 def maps(
     file: Annotated[
         str, typer.Argument(metavar="[FILE]", help="Map file or the name of a bundled map.")
-    ] = "route",
+    ] = "long_route",
     json_file: JsonOption = None,
     markdown_file: Annotated[
         Path | None, typer.Option("--markdown", metavar="FILE", help="Write the tables as Markdown.")
@@ -221,12 +228,12 @@ def _facts(network: Network) -> dict[str, Any]:
     }
 
 
-def _report(network: Network) -> dict[str, Any]:
-    """The import report as plain values."""
-    counts: dict[str, dict[str, int]] = {element: {} for element in network.report.elements()}
-    for (element, action), count in network.report.counts.items():
+def _report(report: ImportReport) -> dict[str, Any]:
+    """An import report as plain values."""
+    counts: dict[str, dict[str, int]] = {element: {} for element in report.elements()}
+    for (element, action), count in report.counts.items():
         counts[element][action.value] = count
-    return {"counts": counts, "notes": [vars(note) for note in network.report.notes]}
+    return {"counts": counts, "notes": [vars(note) for note in report.notes]}
 
 
 def _say(value: Any) -> str:

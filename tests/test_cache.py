@@ -259,16 +259,21 @@ def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
     calls = []
     build = lane_map.build_lane_map
 
-    def counted(network, goals=None):
+    def counted(network, goals=None, *, report=None):
         calls.append(goals)
-        return build(network, goals)
+        assert report is not None
+        report.approximated("lane", "somewhere", "by 1 mm")
+        return build(network, goals, report=report)
 
     monkeypatch.setattr(lane_map, "build_lane_map", counted)
     network = lj.load_map(file)
     goals = [lane.id for lane in network.drivable_lanes() if not lane.successors][:2]
     assert len(goals) == 2
-    built, kept = lj.build_lane_map(network), lj.build_lane_map(lj.load_map(file))
+    first, second = ImportReport(), ImportReport()
+    built = lj.build_lane_map(network, report=first)
+    kept = lj.build_lane_map(lj.load_map(file), report=second)
     assert calls == [None]
+    assert first == second and "somewhere" in str(second.notes)
     assert jax.tree.structure(built) == jax.tree.structure(kept)
     for a, b in zip(jax.tree.leaves(built), jax.tree.leaves(kept), strict=True):
         assert isinstance(b, jax.Array) and a.dtype == b.dtype

@@ -31,7 +31,8 @@ def two_roads(*, gap: float = 0.0, turn: float = 0.0, extra: str = "") -> str:
 </road>
 <road name="" length="50" id="2" junction="-1">
   <link><predecessor elementType="road" elementId="1" contactPoint="end"/></link>
-  <planView><geometry s="0" x="{100 + gap}" y="0" hdg="{turn}" length="50"><line/></geometry></planView>{LANES}
+  <planView><geometry s="0" x="{100 + gap}" y="0" hdg="{turn}" length="50"><line/></geometry></planView>
+  {LANES}
 </road>
 </OpenDRIVE>
 """

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from limsim_jax.maps import cache as _cache
-from limsim_jax.maps.network import MapError, Network
+from limsim_jax.maps.network import ImportReport, MapError, Network
 
 if TYPE_CHECKING:
     from limsim_jax.maps.lane_map import LaneMap
@@ -50,7 +50,13 @@ def load_map(path: str | Path, *, cache: bool = True) -> Network:
     return network
 
 
-def build_lane_map(network: Network, goals: Sequence[str] | None = None, *, cache: bool = True) -> LaneMap:
+def build_lane_map(
+    network: Network,
+    goals: Sequence[str] | None = None,
+    *,
+    report: ImportReport | None = None,
+    cache: bool = True,
+) -> LaneMap:
     """Turn a network into device arrays: see `limsim_jax.maps.lane_map.build_lane_map`.
 
     With `cache` the arrays of a network that comes straight from `load_map` are kept on disk.
@@ -60,15 +66,19 @@ def build_lane_map(network: Network, goals: Sequence[str] | None = None, *, cach
 
     from limsim_jax.maps import lane_map
 
+    notes = ImportReport()
     identity = _loaded.get(network) if cache else None
-    if identity is None:
-        return lane_map.build_lane_map(network, goals)
-    name = _cache.key("lanes", *identity, repr(goals if goals is None else list(goals)))
-    built = _cache.load(name)
-    if isinstance(built, lane_map.LaneMap):
-        return jax.device_put(built)
-    built = lane_map.build_lane_map(network, goals)
-    _cache.store(name, jax.tree.map(np.asarray, built))
+    name = _cache.key("lanes", *(identity or ()), repr(goals if goals is None else list(goals)))
+    match _cache.load(name) if identity else None:
+        case (lane_map.LaneMap() as arrays, ImportReport() as notes):
+            built = jax.device_put(arrays)
+        case _:
+            built = lane_map.build_lane_map(network, goals, report=notes)
+            if identity:
+                _cache.store(name, (jax.tree.map(np.asarray, built), notes))
+    if report is not None:
+        report.counts.update(notes.counts)
+        report.notes.extend(notes.notes)
     return built
 
 

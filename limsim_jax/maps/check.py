@@ -42,6 +42,16 @@ def seams(network: Network, *, gap: float = GAP, kink: float = KINK) -> Iterator
                 yield seam
 
 
+def deadlocks(network: Network) -> list[list[str]]:
+    """Circles of right of way in which everyone yields to the next, as lane ids: see `priority_cycles`."""
+    from limsim_jax.maps.conflicts import build_conflicts, connectors, priority_cycles
+    from limsim_jax.maps.lane_map import lane_rows
+
+    lanes = connectors(network)
+    table = build_conflicts(network, lane_rows(network))
+    return [[lanes[k].id for k in cycle] for cycle in priority_cycles(table)]
+
+
 def _seam(before: Lane, after: Lane) -> Seam:
     turn = float(after.heading[0] - before.heading[-1])
     return Seam(
