@@ -9,6 +9,7 @@ matplotlib (extra `viz`) is imported when something is drawn, never before.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass, field
@@ -292,7 +293,8 @@ class _Painter:
             edge: list[Array] = []
             kerb: list[Array] = []
             done: set[frozenset[str]] = set()
-            for shape in shapes:
+            # Lanes with traffic first: the border that they share with others is theirs.
+            for shape in sorted(shapes, key=lambda shape: not shape.lane.drivable):
                 lane = shape.lane
                 if lane.junction is not None:
                     continue
@@ -587,7 +589,7 @@ class _Painter:
     def labels(self) -> None:
         """Ids of roads along them and of junctions on them, each where it finds room."""
         top = max(self.levels.values(), default=0)
-        size = 6.0
+        size = 7.0
         placed: list[Bounds] = []
 
         def room(xy: Any, text: str) -> bool:
@@ -608,7 +610,8 @@ class _Painter:
         longest: dict[str, _Shape] = {}
         for shape in self.shapes.values():
             best = longest.get(shape.lane.road)
-            if best is None or shape.lane.length > best.lane.length:
+            key = (shape.lane.drivable, shape.lane.length)
+            if best is None or key > (best.lane.drivable, best.lane.length):
                 longest[shape.lane.road] = shape
         # Roads outside junctions first, then the longer ones: they get the room.
         order = sorted(
@@ -743,30 +746,61 @@ _WIDTH, _HEIGHT = 14.0, 11.5  # largest page without `size`
 _CLEAR = 0.03  # inches per metre at which a lane and its marks are easy to read
 
 
-def _strips(view: Bounds, room: tuple[float, float]) -> tuple[list[Bounds], bool, float]:
+def _strips(
+    shapes: dict[str, _Shape], view: Bounds, room: tuple[float, float]
+) -> tuple[list[Bounds], bool, float]:
     """Cut a view into strips along its longer side so that the scale on the page is as large as it gets.
 
+    Every strip follows the road: its window moves across to where the lanes are. Strips are only used
+    while fewer do not give a clear scale.
+
     Returns the strips in reading order, whether they lie below each other (else side by side) and the
-    scale in inches per metre. Strips are only used while one is not enough for a clear scale.
+    scale in inches per metre.
     """
     x0, y0, x1, y1 = view
     wide = x1 - x0 >= y1 - y0
-    long, short = (x1 - x0, y1 - y0) if wide else (y1 - y0, x1 - x0)
+    axis = 0 if wide else 1
+    start, long = view[axis], view[axis + 2] - view[axis]
+    low, high = view[1 - axis], view[3 - axis]
     along, across = room if wide else room[::-1]
+    step = long / 400
+    points = np.concatenate(
+        [
+            shape.at(np.linspace(0, shape.s[-1], 2 + int(shape.s[-1] / step)), border)
+            for shape in shapes.values()
+            for border in (shape.left, shape.right)
+        ]
+    )
+    margin = min(4.0 + step, 0.5 * (high - low))
 
-    def scale(count: int) -> float:
-        return min(along / (long / count), max(0.0, across - (count - 1) * _GAP) / (count * short))
+    def cut(count: int) -> tuple[list[Bounds], float]:
+        edges = np.linspace(start, start + long, count + 1).tolist()
+        spans = []
+        for a, b in itertools.pairwise(edges):
+            inside = (points[:, axis] >= a - step) & (points[:, axis] <= b + step)
+            seen = np.clip(points[inside, 1 - axis], low, high)
+            spans.append((seen.min() - margin, seen.max() + margin) if seen.size else (low, low))
+        short = high - low if count == 1 else max(b - a for a, b in spans)
+        windows = [
+            (low, high) if count == 1 else ((a + b - short) / 2, (a + b + short) / 2) for a, b in spans
+        ]
+        scale = min(along / (long / count), max(0.0, across - (count - 1) * _GAP) / (count * short))
+        boxes = [
+            (a, c, b, d) if wide else (c, a, d, b)
+            for (a, b), (c, d) in zip(itertools.pairwise(edges), windows, strict=True)
+        ]
+        return boxes, scale
 
-    count = 1
-    while (
-        scale(count) < _CLEAR and long > 1.5 * short * (count + 1) and scale(count + 1) > 1.05 * scale(count)
-    ):
-        count += 1
-    cuts = np.linspace(x0 if wide else y0, x1 if wide else y1, count + 1)
-    pairs = list(zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True))
-    if wide:
-        return [(a, y0, b, y1) for a, b in pairs], True, scale(count)
-    return [(x0, a, x1, b) for a, b in pairs], False, scale(count)
+    best, scale = cut(1)
+    for count in range(2, 17):
+        boxes, larger = cut(count)
+        short = boxes[0][3 - axis] - boxes[0][1 - axis]
+        if scale >= _CLEAR or long / count < 0.8 * short:
+            break
+        thin = long > 2.5 * (high - low) or short < 0.6 * (high - low)
+        if thin and larger > 1.25 * scale:
+            best, scale = boxes, larger
+    return best, wide, scale
 
 
 def draw_map(
@@ -812,7 +846,7 @@ def draw_map(
     room = (page[0] - left - _LEGEND, page[1] - bottom - top)
     if min(room) < 0.5:
         raise MapError(f"size {page} inches leaves no room for the map", file=network.source)
-    strips, stacked, scale = _strips(view, room)
+    strips, stacked, scale = _strips(shapes, view, room)
     wide, tall = strips[0][2] - strips[0][0], strips[0][3] - strips[0][1]
     rows, columns = (len(strips), 1) if stacked else (1, len(strips))
     if size is None:
@@ -830,8 +864,9 @@ def draw_map(
         ax = figure.add_axes((x / page[0], y / page[1], cell[0] / page[0], cell[1] / page[1]))
         ax.set_anchor("C")
         # Room that a strip does not need shows its surroundings, but never its neighbours.
-        spare_x = max(0.0, cell[0] / scale - wide) / 2 if columns == 1 else 0.0
-        spare_y = max(0.0, cell[1] / scale - tall) / 2 if rows == 1 else 0.0
+        alone = len(strips) == 1
+        spare_x = max(0.0, cell[0] / scale - wide) / 2 if alone or not stacked else 0.0
+        spare_y = max(0.0, cell[1] / scale - tall) / 2 if alone or stacked else 0.0
         box = (strip[0] - spare_x, strip[1] - spare_y, strip[2] + spare_x, strip[3] + spare_y)
         painter = _paint(ax, network, shapes, levels, box, conflicts=conflicts, labels=labels)
         legend |= painter.legend
