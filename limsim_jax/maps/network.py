@@ -436,7 +436,9 @@ class Network:
         """Lanes of a road, in file order. Raises `MapError` if the map has no such road."""
         found = [lane for lane in self.lanes.values() if lane.road == road]
         if not found:
-            raise MapError(f"no road '{road}'; ids look like {', '.join(list(self.roads)[:5])}", file=self.source)
+            raise MapError(
+                f"no road '{road}'; ids look like {', '.join(list(self.roads)[:5])}", file=self.source
+            )
         return found
 
     def lane_at(self, road: str, number: int, road_s: float) -> Lane:

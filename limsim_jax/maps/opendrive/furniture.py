@@ -287,7 +287,7 @@ class Furnisher:
         if not outlines and thing.length > 0 and thing.width >= 0:
             u, v = thing.length / 2, thing.width / 2
             box = np.array([(-u, -v), (u, -v), (u, v), (-u, v)])
-            outlines = [_turned(box, heading + thing.heading) + (x, y)]
+            outlines = [_turned(box, heading + thing.heading) + np.array([x, y])]
         if thing.type == "crosswalk":
             if not outlines or len(outlines[0]) < 3:
                 self.report.ignored("crosswalk", where, "has neither an outline nor a size", thing.line)
@@ -324,9 +324,7 @@ class Furnisher:
                     return
         self.report.ignored("object", where, f"{thing.type} '{thing.name}'", thing.line)
 
-    def _outline(
-        self, road: RawRoad, thing: RawObject, corners: list[tuple[bool, float, float]]
-    ) -> Array:
+    def _outline(self, road: RawRoad, thing: RawObject, corners: list[tuple[bool, float, float]]) -> Array:
         shape = RoadShape(road)
         x, y, _, heading = shape.point(thing.s, thing.t)
         points = []
@@ -334,7 +332,9 @@ class Furnisher:
             if on_road:
                 points.append(shape.point(p, q)[:2])
             else:
-                points.append(tuple(_turned(np.array([[p, q]]), heading + thing.heading)[0] + (x, y)))
+                points.append(
+                    tuple(_turned(np.array([[p, q]]), heading + thing.heading)[0] + np.array([x, y]))
+                )
         if len(points) > 2 and np.allclose(points[0], points[-1], atol=1e-3):
             points.pop()
         return np.array(points)

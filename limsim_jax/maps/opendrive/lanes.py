@@ -189,9 +189,7 @@ class Cutter:
             changes = {section.s + r for lane in section.lanes.values() for r in _changes(lane)}
             changes |= {s for s, _, _ in road.types}
             jumps = self._jumps(shape, section, start, end)
-            cuts = sorted(
-                {s for s in changes | jumps | extra if start + MIN_SECTION < s < end - MIN_SECTION}
-            )
+            cuts = sorted({s for s in changes | jumps | extra if start + MIN_SECTION < s < end - MIN_SECTION})
             edges = [start, *cuts, end]
             for a, b in itertools.pairwise(edges):
                 atoms.append((k, section, a, b, a in jumps or _near(a, extra)))
@@ -273,9 +271,7 @@ class Cutter:
             linked = number in lane.successors or number in section1.lanes[number].predecessors
             extra = set(lane.successors) | set(section1.lanes[number].predecessors)
             others = {
-                n
-                for n, other in section1.lanes.items()
-                if n != number and number in other.predecessors
+                n for n, other in section1.lanes.items() if n != number and number in other.predecessors
             } | {n for n, other in section0.lanes.items() if n != number and number in other.successors}
             if not linked or extra - {number} or others:
                 return False
@@ -312,9 +308,7 @@ class Cutter:
             )
         return result
 
-    def _real(
-        self, road: str, shape: RoadShape, section: RawSection, numbers: list[int]
-    ) -> list[int]:
+    def _real(self, road: str, shape: RoadShape, section: RawSection, numbers: list[int]) -> list[int]:
         """The lanes of a section that somewhere have a width."""
         key = (road, section.line, section.s)
         if key not in self._wide:

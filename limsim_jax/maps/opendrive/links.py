@@ -7,6 +7,7 @@ directions then make it a directed edge. So it does not matter which side said i
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -84,15 +85,11 @@ class Linker:
             for number, lane in section.lanes.items():
                 for other in lane.successors:
                     if number and other:
-                        self._touch(
-                            (road.id, k, number, "end"), (road.id, k + 1, other, "start"), lane.line
-                        )
+                        self._touch((road.id, k, number, "end"), (road.id, k + 1, other, "start"), lane.line)
             for number, lane in following.lanes.items():
                 for other in lane.predecessors:
                     if number and other:
-                        self._touch(
-                            (road.id, k, other, "end"), (road.id, k + 1, number, "start"), lane.line
-                        )
+                        self._touch((road.id, k, other, "end"), (road.id, k + 1, number, "start"), lane.line)
 
     def _road_link(self, road: RawRoad, link: RoadLink | None, end: str) -> None:
         if link is None:
@@ -148,7 +145,8 @@ class Linker:
             if abs(edge - link.s) < 2 * MIN_SECTION:
                 section, _, _ = piece.parts[-1 if before else 0]
                 k = next(i for i, s in enumerate(other.sections) if s is section)
-                self._touch(mine, (other.id, k, target, f"{'end' if before else 'start'}@{piece.index}"), link.line)  # fmt: skip
+                side = "end" if before else "start"
+                self._touch(mine, (other.id, k, target, f"{side}@{piece.index}"), link.line)
                 return
         self.report.ignored(
             "road link", f"road {mine[0]}", f"road {other.id} has no place s = {link.s:g}", link.line
@@ -217,7 +215,7 @@ class Linker:
                 self.report.ignored(
                     "connection",
                     where,
-                    f"road {incoming.id} does not link to the junction and ends {distance(nearest):.0f} m away",
+                    f"road {incoming.id} has no link to the junction and ends {distance(nearest):.0f} m away",
                     connection.line,
                 )
                 return None
@@ -269,7 +267,9 @@ class Linker:
                 for side in ("start", "end"):
                     me = (road_id, k, number, side)
                     sides[side] = [
-                        (c.b if c.a == me else c.a, c.line) for c in self.contacts.values() if me in (c.a, c.b)
+                        (c.b if c.a == me else c.a, c.line)
+                        for c in self.contacts.values()
+                        if me in (c.a, c.b)
                     ]
                 for a, line in sides["start"]:
                     for b, _ in sides["end"]:
@@ -307,7 +307,7 @@ class Linker:
                 self.through[from_id, to_id].add(contact.junction)
         # cuts inside a section: the piece simply goes on
         for road_id, pieces in self.pieces.items():
-            for before, after in zip(pieces, pieces[1:], strict=False):
+            for before, after in itertools.pairwise(pieces):
                 if before.parts[-1][0] is not after.parts[0][0]:
                     continue
                 for number in before.attributes:
@@ -465,7 +465,7 @@ def with_priorities(
     junctions: dict[str, RawJunction],
     report: ImportReport,
 ) -> tuple[Movement, ...]:
-    """Apply junction `<priority high= low=>` records: ids of connecting (or, in old files, incoming) roads."""
+    """Apply `<priority high= low=>` records: ids of connecting (or, in old files, incoming) roads."""
     yields: dict[int, set[int]] = defaultdict(set)
     high_side: set[int] = set()
     for junction in junctions.values():
@@ -490,17 +490,12 @@ def with_priorities(
             high_side.update(first)
             for m in second:
                 yields[m].update(n for n in first if n != m)
-    return tuple(
-        replace(
-            m,
-            yields_to=frozenset(yields[m.index]),
-            control=Control.YIELD
-            if m.index in yields
-            else Control.PRIORITY
-            if m.index in high_side
-            else m.control,
-        )
-        if m.index in yields or m.index in high_side
-        else m
-        for m in movements
-    )
+    result = []
+    for m in movements:
+        first = frozenset(yields.get(m.index, ()))
+        if first:
+            m = replace(m, control=Control.YIELD, yields_to=first)
+        elif m.index in high_side:
+            m = replace(m, control=Control.PRIORITY)
+        result.append(m)
+    return tuple(result)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import replace
@@ -58,7 +59,7 @@ def read_opendrive(path: str | Path) -> Network:
                         report.ignored(
                             "header offset",
                             "header",
-                            "coordinates are kept as they stand in the file; the offset leads to the geoReference",
+                            "coordinates are kept as in the file; the offset leads to the geoReference",
                             child.sourceline,
                         )
                     else:
@@ -205,7 +206,7 @@ def _report_road(road: RawRoad, pieces: list[Piece], report: ImportReport) -> No
                 "s is spread evenly along it",
                 record.line,
             )
-    for before, after in zip(records, records[1:], strict=False):
+    for before, after in itertools.pairwise(records):
         s, at = np.array([after.s]), np.array([before.s + before.length / 2])
         x, y, heading, _, _ = road.reference.frame(s, at)
         gap = float(np.hypot(x[0] - after.x, y[0] - after.y))
@@ -246,7 +247,7 @@ def _connector_speeds(
         report.approximated(
             "speed limit",
             f"road {road}",
-            f"the file gives none for this connecting road: {', '.join(f'{v:g}' for v in sorted(limits))} km/h "
-            "as on the lanes it joins",
+            f"the file gives none for this connecting road: {' and '.join(f'{v:g}' for v in sorted(limits))} "
+            "km/h as on the lanes it joins",
             roads[road].line,
         )

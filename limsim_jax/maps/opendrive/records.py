@@ -7,7 +7,7 @@ the import report can name it.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from limsim_jax.maps.network import ImportReport
 from limsim_jax.maps.opendrive.curves import Cubics, Geometry, Kind, ReferenceLine
@@ -44,6 +44,7 @@ class Ignored:
         self.first: dict[str, tuple[str, int | None]] = {}
 
     def add(self, element: Element, where: str) -> None:
+        """Count an element; `where` names its place for people."""
         parent = element.getparent()
         name = element.tag if parent is None else f"{parent.tag}/{element.tag}"
         self.count[name] += 1
@@ -216,6 +217,7 @@ class Parser:
     # --- road -----------------------------------------------------------------------------------
 
     def road(self, e: Element) -> RawRoad:
+        """A `<road>`."""
         get, where = self.get, f"road {e.get('id')}"
         junction = get.text(e, "junction", "-1")
         rule = get.text(e, "rule", "RHT").upper()
@@ -351,9 +353,7 @@ class Parser:
                 )
                 continue
             if s < -1e-6 or s > road.length + 1.0:
-                get.fail(
-                    child, f"attribute 's' is {s:g}, outside the road, which is {road.length:g} m long"
-                )
+                get.fail(child, f"attribute 's' is {s:g}, outside the road, which is {road.length:g} m long")
             records.append(self._geometry(child, shapes[0], s, x, y, heading, length))
             self.report.read(f"geometry {shapes[0].tag}")
         return ReferenceLine(records)
@@ -362,33 +362,38 @@ class Parser:
         self, e: Element, shape: Element, s: float, x: float, y: float, heading: float, length: float
     ) -> Geometry:
         number = self.get.number
-        base = dict(s=s, x=x, y=y, heading=heading, length=length, line=e.sourceline)
+        base = Geometry(s=s, x=x, y=y, heading=heading, length=length, kind=Kind.CLOTHOID, line=e.sourceline)
         match shape.tag:
             case "line":
-                return Geometry(**base, kind=Kind.CLOTHOID)
+                return base
             case "arc":
                 curvature = number(shape, "curvature")
                 self._check_turn(shape, curvature * length)
-                return Geometry(**base, kind=Kind.CLOTHOID, curvature=curvature)
+                return replace(base, curvature=curvature)
             case "spiral":
                 k0, k1 = number(shape, "curvStart"), number(shape, "curvEnd")
                 self._check_turn(shape, max(abs(k0), abs(k1)) * length)
-                return Geometry(**base, kind=Kind.CLOTHOID, curvature=k0, sharpness=(k1 - k0) / length)
+                return replace(base, curvature=k0, sharpness=(k1 - k0) / length)
             case "poly3":
                 a, b, c, d = (number(shape, k, 0.0) for k in "abcd")
-                return Geometry(**base, kind=Kind.PARAMETRIC, u=(0.0, 1.0, 0.0, 0.0), v=(a, b, c, d))
+                return replace(base, kind=Kind.PARAMETRIC, u=(0.0, 1.0, 0.0, 0.0), v=(a, b, c, d))
             case "paramPoly3":
                 p_range = self.get.text(shape, "pRange", "normalized")
                 if p_range not in ("normalized", "arcLength"):
-                    self.get.fail(
-                        shape, f"attribute 'pRange' is '{p_range}', not normalized or arcLength"
+                    self.get.fail(shape, f"attribute 'pRange' is '{p_range}', not normalized or arcLength")
+                u, v = (
+                    (
+                        number(shape, f"a{axis}", 0.0),
+                        number(shape, f"b{axis}", 0.0),
+                        number(shape, f"c{axis}", 0.0),
+                        number(shape, f"d{axis}", 0.0),
                     )
-                u = tuple(number(shape, f"{k}U", 0.0) for k in "abcd")
-                v = tuple(number(shape, f"{k}V", 0.0) for k in "abcd")
+                    for axis in "UV"
+                )
                 p_end = 1.0 if p_range == "normalized" else length
                 if not any(u[1:]) and not any(v[1:]):
                     self.get.fail(shape, "is a single point: all of bU..dU and bV..dV are zero")
-                return Geometry(**base, kind=Kind.PARAMETRIC, u=u, v=v, p_end=p_end)
+                return replace(base, kind=Kind.PARAMETRIC, u=u, v=v, p_end=p_end)
         self.get.fail(shape, "unknown shape: one of line, spiral, arc, poly3, paramPoly3 must stand here")
 
     def _check_turn(self, e: Element, angle: float) -> None:
@@ -522,9 +527,7 @@ class Parser:
 
     def _validity(self, e: Element) -> list[tuple[int, int]]:
         return [
-            (self.get.integer(v, "fromLane"), self.get.integer(v, "toLane"))
-            for v in e
-            if v.tag == "validity"
+            (self.get.integer(v, "fromLane"), self.get.integer(v, "toLane")) for v in e if v.tag == "validity"
         ]
 
     def _signals(self, e: Element, road: RawRoad) -> None:
@@ -601,6 +604,7 @@ class Parser:
     # --- junctions and controllers --------------------------------------------------------------
 
     def junction(self, e: Element) -> RawJunction:
+        """A `<junction>`."""
         get = self.get
         junction = RawJunction(
             id=get.text(e, "id"),
@@ -653,6 +657,7 @@ class Parser:
         self.report.read("laneLink", len(links))
 
     def controller(self, e: Element) -> RawController:
+        """A `<controller>`."""
         signals = []
         for child in e:
             if child.tag == "control":
