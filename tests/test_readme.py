@@ -1,0 +1,31 @@
+"""The README's example runs and says the truth."""
+
+import math
+import re
+
+from conftest import REPO
+
+import limsim_jax as lj
+
+README = (REPO / "README.md").read_text()
+
+
+def test_example(capsys):
+    (code,) = re.findall(r"<!-- test: example -->\n```python\n(.*?)```", README, re.DOTALL)
+    names = {}
+    exec(compile(code, "README.md", "exec"), names)
+    assert "laneSection" in capsys.readouterr().out
+    assert abs(float(names["s"]) - 25.0) < 1e-3 and abs(float(names["d"]) - 0.5) < 1e-3
+    assert math.isclose(float(names["slope"]), math.cos(float(names["heading"])), abs_tol=1e-3)
+
+
+def test_bundled_maps_are_listed():
+    for name in lj.bundled_maps():
+        assert f"`{name}`" in README
+
+
+def test_pictures_and_tables_exist():
+    links = re.findall(r"\]\(([^)#]+)\)", README)
+    assert any(link.endswith(".png") for link in links)
+    for link in links:
+        assert link.startswith("https://") or (REPO / link).is_file(), link
