@@ -19,7 +19,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, overload
+from typing import Any, BinaryIO, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -97,11 +97,11 @@ ENGINE_CLASS = {
 }
 """Vehicle class of the engine for a vehicle of a SUMO class; the others are no motor traffic on roads."""
 
-DEMAND_ROOTS = ("additional", "additionals", "add", "routes", "route-alternatives", "trips", "vtypes", "flows")
+DEMAND_ROOTS = tuple("additional additionals add routes route-alternatives trips vtypes flows".split())
 """Root elements of additional and route files; SUMO itself does not look at them."""
 
 _SPECIAL_RIGHTS = frozenset({"emergency", "authority", "army", "vip"})
-_MOTOR = frozenset({"passenger", "private", "evehicle", "delivery", "truck", "trailer", "motorcycle", "moped"})
+_MOTOR = frozenset("passenger private evehicle delivery truck trailer motorcycle".split())
 _FOOT = frozenset({"pedestrian", "wheelchair"})
 _RAIL = frozenset({"rail_urban", "rail", "rail_electric", "rail_fast", "subway"})
 
@@ -117,7 +117,7 @@ _TYPE_OF_CLASSES = (
 )
 """Lane type by the first group of classes of which one is allowed, on lanes without general motor traffic."""
 
-_UNUSED_TYPES = frozenset({"shoulder", "border", "stop", "restricted", "parking", "median", "curb", "sidewalk"})
+_UNUSED_TYPES = frozenset("shoulder border stop restricted parking median curb sidewalk".split())
 
 _TURNS = {
     "s": Turn.STRAIGHT,
@@ -170,8 +170,16 @@ def open_xml(data: bytes, path: str | Path) -> BinaryIO:
 
 
 _PARSER: dict[str, Any] = dict(
-    resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False, remove_comments=True, remove_pis=True
-)  # without huge_tree libxml2 bounds depth, attribute size and entity expansion
+    resolve_entities=False,
+    no_network=True,
+    load_dtd=False,
+    huge_tree=False,  # so libxml2 bounds depth, attribute size and entity expansion
+    remove_comments=True,
+    remove_pis=True,
+)
+
+
+_REQUIRED: Any = object()  # in place of a default
 
 
 @dataclass
@@ -196,10 +204,11 @@ class XmlFile:
     def check_document(self, root: Any, names: tuple[str, ...]) -> None:
         """Raise `MapError` for a document type definition or a root element other than `names`."""
         if root.getroottree().docinfo.internalDTD is not None:
-            raise MapError("document type definitions are not accepted; delete the <!DOCTYPE ...>", file=self.path)
+            raise MapError("document types are not accepted; delete the <!DOCTYPE ...>", file=self.path)
         if root.tag not in names:
             wanted = " or ".join(f"<{name}>" for name in names)
-            raise MapError(f"root element is <{root.tag}>, not {wanted}", file=self.path, line=root.sourceline)
+            reason = f"the root element is <{root.tag}>, not {wanted}"
+            raise MapError(reason, file=self.path, line=root.sourceline)
 
     @overload
     def text(self, element: Any, name: str) -> str: ...
@@ -207,14 +216,14 @@ class XmlFile:
     def text(self, element: Any, name: str, default: str) -> str: ...
     @overload
     def text(self, element: Any, name: str, default: None) -> str | None: ...
-    def text(self, element: Any, name: str, *default: str | None) -> str | None:
+    def text(self, element: Any, name: str, default: Any = _REQUIRED) -> str | None:
         """An attribute as it stands; `MapError` if it is missing and there is no default."""
         self.known[element.tag].add(name)
         value = element.get(name)
         if value is None:
-            if not default:
+            if default is _REQUIRED:
                 raise self.error(element, f"attribute '{name}' is missing")
-            return default[0]
+            return default
         return value
 
     @overload
@@ -223,11 +232,13 @@ class XmlFile:
     def number(self, element: Any, name: str, default: float, *, minimum: float = ...) -> float: ...
     @overload
     def number(self, element: Any, name: str, default: None, *, minimum: float = ...) -> float | None: ...
-    def number(self, element: Any, name: str, *default: float | None, minimum: float = -math.inf) -> float | None:
+    def number(
+        self, element: Any, name: str, default: Any = _REQUIRED, *, minimum: float = -math.inf
+    ) -> float | None:
         """A finite number not below `minimum`; `MapError` for anything else."""
-        value = self.text(element, name) if not default else self.text(element, name, None)
+        value = self.text(element, name) if default is _REQUIRED else self.text(element, name, None)
         if value is None:
-            return default[0]
+            return default
         return self.parse_number(element, name, value, minimum)
 
     def parse_number(self, element: Any, name: str, value: str, minimum: float = -math.inf) -> float:
@@ -248,9 +259,9 @@ class XmlFile:
     def integer(self, element: Any, name: str, default: int) -> int: ...
     @overload
     def integer(self, element: Any, name: str, default: None) -> int | None: ...
-    def integer(self, element: Any, name: str, *default: int | None) -> int | None:
+    def integer(self, element: Any, name: str, default: Any = _REQUIRED) -> int | None:
         """An integer; `MapError` for anything else."""
-        number = self.number(element, name, *default)  # type: ignore[call-overload]
+        number = self.number(element, name, default)
         if number is None:
             return None
         if number != int(number):
@@ -321,12 +332,16 @@ def parse_xml(path: str | Path, roots: tuple[str, ...], report: ImportReport) ->
     return xml, root, hashlib.sha256(data).hexdigest()
 
 
-def stream_xml(path: str | Path, roots: tuple[str, ...], report: ImportReport) -> Iterator[tuple[XmlFile, Any]]:
+def stream_xml(
+    path: str | Path, roots: tuple[str, ...], report: ImportReport
+) -> Iterator[tuple[XmlFile, Any]]:
     """Children of the root element one at a time, forgotten after use: for files of any size."""
     xml = XmlFile(str(path), report)
     root = None
     try:
-        for event, element in etree.iterparse(open_xml(read_bytes(path), path), events=("start", "end"), **_PARSER):
+        for event, element in etree.iterparse(
+            open_xml(read_bytes(path), path), events=("start", "end"), **_PARSER
+        ):
             if root is None:
                 root = element
                 xml.check_document(root, roots)
@@ -375,9 +390,10 @@ class Curve:
         return xy, self.heading[i] + 2 * half, self.curvature[i]
 
     def samples(self, lo: float = 0.0, hi: float = math.inf) -> Float[Array, " M"]:
-        """Arc lengths (m) from `lo` to `hi`, between which cubic Hermite interpolation is within `SAMPLE_ERROR` of the curve.
+        """Arc lengths (m) from `lo` to `hi` between which cubic Hermite interpolation is good.
 
-        A jump of curvature lies between two samples 1 mm apart, so that linear interpolation keeps it.
+        Its error is at most `SAMPLE_ERROR`. A jump of curvature lies between two samples 1 mm apart, so
+        that linear interpolation keeps it.
         """
         kappa = np.abs(self.curvature)
         # Over an arc of angle t and radius R the cubic is off by R t^4 / 384.
@@ -729,6 +745,10 @@ class _Reader:
             return VEHICLE_CLASSES - names(disallow)
         return VEHICLE_CLASSES
 
+    def _permissions(self, element: Any) -> frozenset[str]:
+        allow, disallow = (self.xml.text(element, name, None) for name in ("allow", "disallow"))
+        return self._classes(element, allow, disallow)
+
     def _edge(self, element: Any) -> None:
         xml = self.xml
         edge = _Edge(
@@ -756,7 +776,8 @@ class _Reader:
                 self._lane(child, edge, offset)
         if not edge.lanes:
             raise xml.error(element, "the edge has no lanes")
-        for position, lane in enumerate(edge.lanes):  # SUMO goes by the order; netconvert has written wrong ones
+        for position, lane in enumerate(edge.lanes):
+            # SUMO goes by the order; netconvert writes index 0 for all lanes behind a place to wait.
             if lane.index != position:
                 message = f"index {lane.index} taken as {position}, its place in the edge"
                 self.report.repaired("lane", lane.id, message, lane.element.sourceline)
@@ -771,7 +792,7 @@ class _Reader:
             value = self.xml.number(child, "value", minimum=0.0)
             chosen, spared = self.xml.text(child, "vClasses", None), self.xml.text(child, "exceptions", None)
             if chosen is not None or spared is not None:
-                message = "holds for some vehicle classes; here it holds for all if it does for passenger cars"
+                message = "for some vehicle classes; here for all of them if passenger cars are among them"
                 self.report.approximated("stopOffset", element.get("id"), message, child.sourceline)
                 if "passenger" not in self._classes(child, chosen, spared):
                     continue
@@ -790,7 +811,7 @@ class _Reader:
             speed=xml.number(element, "speed", minimum=0.0),
             length=xml.number(element, "length", minimum=0.0),
             width=xml.number(element, "width", DEFAULT_WIDTH),
-            allowed=self._classes(element, xml.text(element, "allow", None), xml.text(element, "disallow", None)),
+            allowed=self._permissions(element),
             change_left=self._classes(element, xml.text(element, "changeLeft", None), None),
             change_right=self._classes(element, xml.text(element, "changeRight", None), None),
             points=xml.shape(element, "shape"),
@@ -839,13 +860,13 @@ class _Reader:
             light=light,
             link=xml.integer(element, "linkIndex") if light else None,
             keep_clear=xml.flag(element, "keepClear", True),
-            allowed=self._classes(element, xml.text(element, "allow", None), xml.text(element, "disallow", None)),
+            allowed=self._permissions(element),
         )
         if connection.state not in _CONTROLS:
             raise xml.error(element, f"state='{connection.state[:40]}' is none of {' '.join(_CONTROLS)}")
         if connection.link is not None and connection.link < 0:
             raise xml.error(element, "linkIndex is negative")
-        xml.text(element, "uncontrolled", None)  # says that the junction's light leaves it alone: it has no tl
+        xml.text(element, "uncontrolled", None)  # the light of the junction leaves it alone: it has no tl
         if connection.via is None and connection.allowed != VEHICLE_CLASSES:
             message = "no lane inside the junction that could carry its permissions"
             self.report.approximated("connection", _name(element), message, element.sourceline)
@@ -913,7 +934,7 @@ class _Reader:
         try:
             following = tuple(int(i) for i in xml.text(element, "next", "").split())
         except ValueError:
-            raise xml.error(element, f"next='{element.get('next')[:40]}' is no list of phase indices") from None
+            raise xml.error(element, f"next='{element.get('next')[:40]}' is no list of phases") from None
         phase = Phase(
             duration=xml.number(element, "duration", minimum=0.0),
             state=state,
@@ -1007,7 +1028,9 @@ class _Reader:
             via = onward[0].via
         return tuple(chain)
 
-    def _place_inside(self, links: dict[str, list[_Connection]], chains: dict[int, tuple[_Lane, ...]]) -> None:
+    def _place_inside(
+        self, links: dict[str, list[_Connection]], chains: dict[int, tuple[_Lane, ...]]
+    ) -> None:
         """Find the junction of every edge inside one."""
         for junction, found in links.items():
             for connection in found:
@@ -1032,7 +1055,8 @@ class _Reader:
     def _lanes(self, chains: dict[int, tuple[_Lane, ...]]) -> dict[str, Lane]:
         curves = self._curves(chains)
         onward = {
-            lane.id: tuple(dict.fromkeys((c.via or c.target).id for c in lane.outgoing)) for lane in self.lanes.values()
+            lane.id: tuple(dict.fromkeys((c.via or c.target).id for c in lane.outgoing))
+            for lane in self.lanes.values()
         }
         back: dict[str, list[str]] = defaultdict(list)
         for lane_id, targets in onward.items():
@@ -1046,6 +1070,9 @@ class _Reader:
                 xy, heading, curvature = curve.at(at)
                 s = at - lo
                 z = np.interp(s, vertex_s, lane.points[:, 2])
+                road_s = (
+                    s * (edge.lanes[0].length / s[-1]) if knots is None else np.interp(s, vertex_s, knots)
+                )
                 left, right = self._neighbours(lane)
                 result[lane.id] = Lane(
                     id=lane.id,
@@ -1057,7 +1084,7 @@ class _Reader:
                     heading=heading,
                     curvature=curvature,
                     width=np.full(len(s), lane.width),
-                    road_s=s * edge.lanes[0].length / s[-1] if knots is None else np.interp(s, vertex_s, knots),
+                    road_s=road_s,
                     declared_length=lane.length,
                     speed_limit=lane.speed,
                     access=self._access(lane),
@@ -1086,7 +1113,7 @@ class _Reader:
         if not allowed:  # nets made from OpenDRIVE still say what it was
             kind = lane.element.get("type", "")
             return LaneType(kind) if kind in _UNUSED_TYPES else LaneType.NONE
-        if allowed & _MOTOR - {"moped"}:
+        if allowed & _MOTOR:
             entry = self.xml.flag(lane.element, "acceleration")
             return LaneType.ENTRY if entry else LaneType.DRIVING
         for classes, kind in _TYPE_OF_CLASSES:
@@ -1095,7 +1122,7 @@ class _Reader:
         return LaneType.SPECIAL
 
     def _neighbours(self, lane: _Lane) -> tuple[_Lane | None, _Lane | None]:
-        """Left and right: index 0 lies at the edge of the road, which is on the left with left-hand traffic."""
+        """Left and right. Index 0 lies at the edge of the road: on the left with left-hand traffic."""
         if lane.edge.function not in {"normal", "internal"}:
             return None, None
         lanes = lane.edge.lanes
@@ -1110,8 +1137,8 @@ class _Reader:
         granted = lane.change_left if other.index > lane.index else lane.change_right
         common = lane.allowed & other.allowed
         ordinary = (granted & common) - _SPECIAL_RIGHTS
-        if common and granted != VEHICLE_CLASSES and common - granted - _SPECIAL_RIGHTS and ordinary:
-            message = f"only {_short(sorted(ordinary))} may change to {other.id}; here all may that use both lanes"
+        if ordinary and common - granted - _SPECIAL_RIGHTS:
+            message = f"only {_short(sorted(ordinary))} may change to {other.id}; here all that use both may"
             self.report.approximated("lane", lane.id, message, lane.element.sourceline)
         return bool(ordinary or (common and not common - _SPECIAL_RIGHTS and granted & common))
 
@@ -1123,7 +1150,7 @@ class _Reader:
     def _curves(
         self, chains: dict[int, tuple[_Lane, ...]]
     ) -> dict[str, tuple[Curve, float, float, Float[Array, " K"]]]:
-        """Per lane: a curve, the part of it that is the lane, and the arc length on the lane of each vertex."""
+        """Per lane: a curve, the part of it that is the lane, and where on the lane its vertices are (m)."""
         curves: dict[str, tuple[Curve, float, float, Any]] = {}
         worst: dict[str, tuple[float, int, str]] = {}
 
@@ -1157,7 +1184,8 @@ class _Reader:
             chain = chains[id(connection)]
             if not chain or any(lane.edge.function != "internal" or lane.id in curves for lane in chain):
                 continue
-            joined = all(np.hypot(*(a.points[-1] - b.points[0])[:2]) < 1.5 * RESOLUTION for a, b in pairwise(chain))
+            gaps = [np.hypot(*(b.points[0] - a.points[-1])[:2]) for a, b in pairwise(chain)]
+            joined = max(gaps, default=0.0) < 1.5 * RESOLUTION
             for lanes in [chain] if joined else [(lane,) for lane in chain]:
                 parts = [lane.points if i == 0 else lane.points[1:] for i, lane in enumerate(lanes)]
                 before, after = curves[connection.source.id], curves[connection.target.id]
@@ -1178,11 +1206,8 @@ class _Reader:
                 add(lane, curve, 0.0, curve.total, curve.vertex_s)
                 note((lane,), curve)
         for kind, (deviation, count, where) in worst.items():
-            message = (
-                f"polylines of {count} lanes became arcs and lines, which leave them by up to {deviation:.3f} m"
-                f" (lane {where})"
-            )
-            self.report.approximated("shape", f"{kind} lanes", message)
+            message = f"arcs and lines for {count} polylines, which they leave by up to {deviation:.3f} m"
+            self.report.approximated("lane@shape", f"{kind} lanes, worst {where}", message)
         return curves
 
     def _compare_lengths(self) -> None:
@@ -1205,7 +1230,7 @@ class _Reader:
                     parallel.append((abs(size - lane.length), lane.id))
         if parallel:
             worst, where = max(parallel)
-            message = f"{len(parallel)} lanes in bends differ from the length of their edge by up to {worst:.2f} m"
+            message = f"{len(parallel)} lanes in bends differ from their edge's length by up to {worst:.2f} m"
             self.report.approximated("lane@length", f"lane {where}", message)
 
     def _clean(self, lane: _Lane) -> Float[Array, "K 3"]:
@@ -1216,21 +1241,23 @@ class _Reader:
             raise self.xml.error(lane.element, "the shape is empty")
         if np.abs(points).max() > 1e9:
             raise self.xml.error(lane.element, "the shape lies more than 1e9 m away")
-        size = np.linalg.norm(np.diff(points, axis=0), axis=1)
         step = np.hypot(*np.diff(points[:, :2], axis=0).T)
         keep = np.append(True, step > 1e-6)
         if not keep.all():
-            self.report.repaired("lane", lane.id, f"{(~keep).sum()} repeated points in its shape left out", line)
+            message = f"{(~keep).sum()} repeated points in its shape left out"
+            self.report.repaired("lane", lane.id, message, line)
             points = points[keep]
         if len(points) == 1:
             heading = self._heading_around(lane)
             self.report.repaired("lane", lane.id, "the shape has no extent; made 1 cm long", line)
-            points = np.stack([points[0], points[0] + RESOLUTION * np.array([np.cos(heading), np.sin(heading), 0.0])])
+            step_on = RESOLUTION * np.array([np.cos(heading), np.sin(heading), 0.0])
+            points = np.stack([points[0], points[0] + step_on])
         return points
 
     def _heading_around(self, lane: _Lane) -> float:
         """Direction of the lanes before or after a lane whose own shape has none."""
-        sources = [other.points[-2:] for other in self.lanes.values() for c in other.outgoing if c.via is lane]
+        lanes = self.lanes.values()
+        sources = [other.points[-2:] for other in lanes for c in other.outgoing if c.via is lane]
         targets = [(c.via or c.target).points[:2] for c in lane.outgoing]
         for points in sources + targets:
             if len(points) == 2 and np.hypot(*(points[1] - points[0])[:2]) > 1e-6:
@@ -1323,7 +1350,7 @@ class _Reader:
         for lane in self.lanes.values():
             for c in lane.outgoing:
                 if id(c) not in listed and lane.edge.function == c.target.edge.function == "normal":
-                    message = "its lane is not among the incoming lanes of any junction; kept as a successor only"
+                    message = "from a lane that is incoming to no junction; kept as a successor only"
                     self.report.approximated("connection", _name(c.element), message, c.element.sourceline)
 
     def _requests(self, element: Any, count: int) -> list[tuple[str, str, bool]]:
@@ -1338,7 +1365,9 @@ class _Reader:
                 if set(bits) - {"0", "1"}:
                     raise self.xml.error(child, f"{name}='{bits[:40]}' has letters other than 0 and 1")
                 if len(bits) != count:
-                    message = f"{name} has {len(bits)} bits, but junction '{element.get('id')}' has {count} links"
+                    message = (
+                        f"{len(bits)} bits of {name}, but junction '{element.get('id')}' has {count} links"
+                    )
                     raise self.xml.error(child, message)
             rows[index] = response, foes, self.xml.flag(child, "cont")
             self._done(child)
@@ -1411,11 +1440,9 @@ class _Reader:
                 side = np.stack([-np.sin(lane.heading), np.cos(lane.heading)], -1) * lane.width[:, None] / 2
                 outline = np.concatenate([lane.xyz[:, :2] + side, (lane.xyz[:, :2] - side)[::-1]])
             crossed = self.xml.text(edge.element, "crossingEdges", "").split()
-            near = [
-                other
-                for other in lanes.values()
-                if other.road in crossed or (other.junction == edge.junction and other.type is not LaneType.SIDEWALK)
-            ]
+            inside = [x for x in lanes.values() if x.junction == edge.junction]
+            near = [x for x in inside if self.edges[x.road].function == "internal"]
+            near += [x for x in lanes.values() if x.road in crossed]
             spans = [(other.id, lo, hi) for other in near for lo, hi in _spans(other, outline)]
             crosswalks.append(
                 Crosswalk(id=edge.id, outline=outline, spans=tuple(spans), line=edge.element.sourceline)

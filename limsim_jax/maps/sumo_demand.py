@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lxml import etree
+
 from limsim_jax.maps.network import ImportReport, MapError, Network
 from limsim_jax.maps.sumo import (
     DEMAND_ROOTS,
@@ -267,82 +269,38 @@ _OPTION_NAMES = {
     for name in names
 }
 
-# Defaults of the vehicle classes where they differ from those of a passenger car
-# (https://sumo.dlr.de/docs/Vehicle_Type_Parameter_Defaults.html).
-_COLUMNS = (
-    "length width height min_gap accel decel emergency_decel max_speed_kmh sigma speed_deviation".split()
-)
-_PASSENGER = dict(zip(_COLUMNS, (5.0, 1.8, 1.5, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.1), strict=True))
-_DEFAULTS: dict[str, dict[str, float]] = {
-    "pedestrian": dict(
-        length=0.215, width=0.478, height=1.719, min_gap=0.25, accel=1.5, decel=2, emergency_decel=5,
-        max_speed_kmh=37.58,
-    ),
-    "wheelchair": dict(
-        length=1.2, width=0.72, height=1.2, min_gap=0.5, accel=1.5, decel=2, emergency_decel=5, max_speed_kmh=30
-    ),
-    "bicycle": dict(
-        length=1.6, width=0.65, height=1.7, min_gap=0.5, accel=1.2, decel=3, emergency_decel=7, max_speed_kmh=50
-    ),
-    "scooter": dict(
-        length=1.2, width=0.5, height=1.7, min_gap=0.5, accel=1.2, decel=3, emergency_decel=7, max_speed_kmh=25
-    ),
-    "moped": dict(
-        length=2.1, width=0.78, height=1.7, accel=1.1, decel=7, emergency_decel=10, max_speed_kmh=60
-    ),
-    "motorcycle": dict(length=2.2, width=0.9, height=1.5, accel=6, decel=10, emergency_decel=10),
-    "taxi": dict(speed_deviation=0.05),
-    "emergency": dict(length=6.5, width=2.16, height=2.86, speed_deviation=0),
-    "authority": dict(speed_deviation=0),
-    "army": dict(speed_deviation=0),
-    "delivery": dict(length=6.5, width=2.16, height=2.86, speed_deviation=0.05),
-    "truck": dict(
-        length=7.1, width=2.4, height=2.4, accel=1.3, decel=4, emergency_decel=7, max_speed_kmh=130,
-        speed_deviation=0.05,
-    ),
-    "trailer": dict(
-        length=16.5, width=2.55, height=4, accel=1.1, decel=4, emergency_decel=7, max_speed_kmh=130,
-        speed_deviation=0.05,
-    ),
-    "bus": dict(
-        length=12, width=2.5, height=3.4, accel=1.2, decel=4, emergency_decel=7, max_speed_kmh=100,
-        speed_deviation=0,
-    ),
-    "coach": dict(
-        length=14, width=2.6, height=4, accel=2, decel=4, emergency_decel=7, max_speed_kmh=100,
-        speed_deviation=0.05,
-    ),
-    "tram": dict(
-        length=22, width=2.4, height=3.2, accel=1, decel=3, emergency_decel=7, max_speed_kmh=80, sigma=0,
-        speed_deviation=0,
-    ),
-    "rail_urban": dict(
-        length=109.5, width=3, height=3.6, min_gap=5, accel=1, decel=3, emergency_decel=7, max_speed_kmh=100,
-        sigma=0, speed_deviation=0,
-    ),
-    "subway": dict(length=109.5, width=3, height=3.6, min_gap=5, max_speed_kmh=100, speed_deviation=0),
-    "rail": dict(
-        length=135, width=2.84, height=3.75, min_gap=5, accel=0.25, decel=1.3, emergency_decel=5,
-        max_speed_kmh=160, sigma=0, speed_deviation=0,
-    ),
-    "rail_electric": dict(
-        length=200, width=2.95, height=3.89, min_gap=5, accel=0.5, decel=1.3, emergency_decel=5,
-        max_speed_kmh=220, sigma=0, speed_deviation=0,
-    ),
-    "rail_fast": dict(
-        length=200, width=2.95, height=3.89, min_gap=5, accel=0.5, decel=1.3, emergency_decel=5,
-        max_speed_kmh=330, sigma=0, speed_deviation=0,
-    ),
-    "ship": dict(
-        length=17, width=4, height=4, accel=0.1, decel=0.15, emergency_decel=1, max_speed_kmh=8 / 1.94 * 3.6,
-        sigma=0,
-    ),
-    "container": dict(length=6.096, width=2.438, height=2.591, speed_deviation=0),
-    "cable_car": dict(speed_deviation=0),
-    "aircraft": dict(length=72.7, width=79.8, speed_deviation=0),
-    "drone": dict(length=0.5, width=0.5, speed_deviation=0),
-    "ignoring": dict(speed_deviation=0),
-}  # fmt: skip
+# https://sumo.dlr.de/docs/Vehicle_Type_Parameter_Defaults.html: length, width, height, min_gap (m), accel,
+# decel, emergency_decel (m/s^2), max_speed (km/h), sigma, deviation of the speed factor.
+_DEFAULTS = {
+    "passenger": (5.0, 1.8, 1.5, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.1),  # and all that are not listed
+    "taxi": (5.0, 1.8, 1.5, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.05),
+    "authority": (5.0, 1.8, 1.5, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.0),
+    "army": (5.0, 1.8, 1.5, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.0),
+    "ignoring": (5.0, 1.8, 1.5, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.0),
+    "emergency": (6.5, 2.16, 2.86, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.0),
+    "delivery": (6.5, 2.16, 2.86, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.05),
+    "truck": (7.1, 2.4, 2.4, 2.5, 1.3, 4.0, 7.0, 130.0, 0.5, 0.05),
+    "trailer": (16.5, 2.55, 4.0, 2.5, 1.1, 4.0, 7.0, 130.0, 0.5, 0.05),
+    "bus": (12.0, 2.5, 3.4, 2.5, 1.2, 4.0, 7.0, 100.0, 0.5, 0.0),
+    "coach": (14.0, 2.6, 4.0, 2.5, 2.0, 4.0, 7.0, 100.0, 0.5, 0.05),
+    "motorcycle": (2.2, 0.9, 1.5, 2.5, 6.0, 10.0, 10.0, 200.0, 0.5, 0.1),
+    "moped": (2.1, 0.78, 1.7, 2.5, 1.1, 7.0, 10.0, 60.0, 0.5, 0.1),
+    "bicycle": (1.6, 0.65, 1.7, 0.5, 1.2, 3.0, 7.0, 50.0, 0.5, 0.1),
+    "scooter": (1.2, 0.5, 1.7, 0.5, 1.2, 3.0, 7.0, 25.0, 0.5, 0.1),
+    "pedestrian": (0.215, 0.478, 1.719, 0.25, 1.5, 2.0, 5.0, 37.58, 0.5, 0.1),
+    "wheelchair": (1.2, 0.72, 1.2, 0.5, 1.5, 2.0, 5.0, 30.0, 0.5, 0.1),
+    "tram": (22.0, 2.4, 3.2, 2.5, 1.0, 3.0, 7.0, 80.0, 0.0, 0.0),
+    "rail_urban": (109.5, 3.0, 3.6, 5.0, 1.0, 3.0, 7.0, 100.0, 0.0, 0.0),
+    "subway": (109.5, 3.0, 3.6, 5.0, 2.6, 4.5, 9.0, 100.0, 0.5, 0.0),
+    "rail": (135.0, 2.84, 3.75, 5.0, 0.25, 1.3, 5.0, 160.0, 0.0, 0.0),
+    "rail_electric": (200.0, 2.95, 3.89, 5.0, 0.5, 1.3, 5.0, 220.0, 0.0, 0.0),
+    "rail_fast": (200.0, 2.95, 3.89, 5.0, 0.5, 1.3, 5.0, 330.0, 0.0, 0.0),
+    "ship": (17.0, 4.0, 4.0, 2.5, 0.1, 0.15, 1.0, 3.6 * 8 / 1.94, 0.0, 0.1),
+    "container": (6.096, 2.438, 2.591, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.0),
+    "cable_car": (5.0, 1.8, 1.5, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.0),
+    "aircraft": (72.7, 79.8, 1.5, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.0),
+    "drone": (0.5, 0.5, 1.5, 2.5, 2.6, 4.5, 9.0, 200.0, 0.5, 0.0),
+}
 
 
 def _time(xml: XmlFile, element: Any, name: str, value: str) -> float:
@@ -456,47 +414,54 @@ class _Reader:
     def _type(self, xml: XmlFile, element: Any) -> str:
         name = xml.text(element, "id")
         self._new(xml, element, name, self.types, self.type_distributions)
+        self.types[name] = self._vehicle_type(xml, element)
+        for child in element:
+            if child.tag.startswith(_MODEL_PREFIX):
+                self.report.read(child.tag)
+            elif child.tag != "param":
+                xml.ignore(child, "not used within <vType>")
+        self.report.read("vType")
+        return name
+
+    def _vehicle_type(self, xml: XmlFile, element: Any) -> VehicleType:
         models = [child for child in element if str(child.tag).startswith(_MODEL_PREFIX)]
         for child in models:  # the old way to give parameters of the car-following model
             for key, value in child.attrib.items():
                 element.set(key, value)
             element.set("carFollowModel", child.tag.removeprefix(_MODEL_PREFIX))
-            self.report.read(child.tag)
         vehicle_class = xml.text(element, "vClass", "passenger")
         vehicle_class = OLD_CLASSES.get(vehicle_class, vehicle_class)
         if vehicle_class not in VEHICLE_CLASSES | {"ignoring"}:
             raise xml.error(element, f"vClass='{vehicle_class[:40]}' is unknown")
-        default = _PASSENGER | _DEFAULTS.get(vehicle_class, {})
+        defaults = _DEFAULTS.get(vehicle_class, _DEFAULTS["passenger"])
+        length, width, height, min_gap, accel, decel, emergency_decel, max_speed, sigma, deviation = defaults
 
         def number(attribute: str, value: float, minimum: float = 0.0) -> float:
             return xml.number(element, attribute, value, minimum=minimum)
 
-        decel = number("decel", default["decel"])
+        decel = number("decel", decel)
         tiny = 1e-9  # these divide
-        self.types[name] = VehicleType(
-            id=name,
+        return VehicleType(
+            id=xml.text(element, "id"),
             vehicle_class=vehicle_class,
             engine_class=ENGINE_CLASS.get(vehicle_class),
             model=xml.text(element, "carFollowModel", "Krauss"),
-            length=number("length", default["length"], tiny),
-            width=number("width", default["width"], tiny),
-            height=number("height", default["height"]),
-            min_gap=number("minGap", default["min_gap"]),
-            accel=number("accel", default["accel"], tiny),
+            length=number("length", length, tiny),
+            width=number("width", width, tiny),
+            height=number("height", height),
+            min_gap=number("minGap", min_gap),
+            accel=number("accel", accel, tiny),
             decel=decel,
-            emergency_decel=number("emergencyDecel", max(decel, default["emergency_decel"])),
+            emergency_decel=number("emergencyDecel", max(decel, emergency_decel)),
             apparent_decel=number("apparentDecel", decel),
-            max_speed=number("maxSpeed", default["max_speed_kmh"] / 3.6, tiny),
+            max_speed=number("maxSpeed", max_speed / 3.6, tiny),
             tau=number("tau", 1.0),
-            sigma=number("sigma", default["sigma"]),
-            speed_factor=self._speed_factor(xml, element, default["speed_deviation"]),
+            sigma=number("sigma", sigma),
+            speed_factor=self._speed_factor(xml, element, deviation),
             probability=self._weight(xml, element),
             parameters=self._rest(xml, element),
             line=element.sourceline,
         )
-        self._children(xml, element, "param", *(child.tag for child in models))
-        self.report.read("vType")
-        return name
 
     def _speed_factor(self, xml: XmlFile, element: Any, deviation: float) -> SpeedFactor:
         text = xml.text(element, "speedFactor", "1").strip()
@@ -779,17 +744,8 @@ class _Reader:
             if name in self.types or name in self.type_distributions:
                 continue
             if name in _PREDEFINED:
-                default = _PASSENGER | _DEFAULTS.get(_PREDEFINED[name], {})
-                speed = default.pop("max_speed_kmh") / 3.6
-                self.types[name] = VehicleType(
-                    id=name,
-                    vehicle_class=_PREDEFINED[name],
-                    engine_class=ENGINE_CLASS.get(_PREDEFINED[name]),
-                    apparent_decel=default["decel"],
-                    max_speed=speed,
-                    speed_factor=SpeedFactor(deviation=default.pop("speed_deviation")),
-                    **default,
-                )
+                element = etree.Element("vType", id=name, vClass=_PREDEFINED[name])
+                self.types[name] = self._vehicle_type(XmlFile("", ImportReport()), element)
             else:
                 message = f"used {count} times, but none of the files defines it"
                 self.report.approximated("vType", name, message)
@@ -820,17 +776,14 @@ class _Reader:
         def check_edges(edges: Iterable[str], what: str, who: str, file: str, line: int | None) -> None:
             for edge in edges:
                 if edge not in network.roads:
-                    raise MapError(
-                        f"edge '{edge}'{what} is not in network {network.source}", file=file, line=line, element=who
-                    )
+                    message = f"edge '{edge}'{what} is not in network {network.source}"
+                    raise MapError(message, file=file, line=line, element=who)
 
         def check_stops(stops: Iterable[Stop], who: str, file: str) -> None:
             for stop in stops:
                 if stop.lane is not None and stop.lane not in network.lanes:
-                    raise MapError(
-                        f"lane '{stop.lane}' of a stop is not in network {network.source}",
-                        file=file, line=stop.line, element=who,
-                    )  # fmt: skip
+                    message = f"lane '{stop.lane}' of a stop is not in network {network.source}"
+                    raise MapError(message, file=file, line=stop.line, element=who)
                 if stop.edge is not None:
                     check_edges([stop.edge], " of a stop", who, file, stop.line)
                 if stop.place is not None and stop.place not in self.stop_places:
