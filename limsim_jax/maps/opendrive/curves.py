@@ -18,11 +18,18 @@ Array = NDArray[np.float64]
 
 
 class Cubics:
-    """Piecewise cubics `a + b ds + c ds^2 + d ds^3`, each from its own `s` on; zero without records."""
+    """Piecewise cubics `a + b ds + c ds^2 + d ds^3`, each from its own `s` on, zero before the first."""
 
-    def __init__(self, records: list[tuple[float, float, float, float, float]]) -> None:
-        """Take `(s, a, b, c, d)` records; of several with the same `s` the last one counts."""
+    def __init__(
+        self, records: list[tuple[float, float, float, float, float]], *, backwards: bool = False
+    ) -> None:
+        """Take `(s, a, b, c, d)` records; of several with the same `s` the last one counts.
+
+        With `backwards` the first record holds before its own `s` too.
+        """
         table = np.array(sorted(records, key=lambda r: r[0]) or [(0.0, 0.0, 0.0, 0.0, 0.0)])
+        if not backwards and table[0, 0] > 0:
+            table = np.concatenate([np.zeros((1, 5)), table])
         self.s: Float[Array, " R"] = table[:, 0]
         self.coefficients: Float[Array, "R 4"] = table[:, 1:]
 
@@ -31,7 +38,7 @@ class Cubics:
         return self.coefficients[i].T, s - self.s[i]
 
     def __call__(self, s: Array, at: Array) -> Array:
-        """Values at `s`; before the first record that record is extended backwards."""
+        """Values at `s`."""
         (a, b, c, d), u = self._local(s, at)
         return a + u * (b + u * (c + u * d))
 

@@ -22,6 +22,8 @@ MIN_SECTION = 1e-3  # m; a lane section shorter than this holds no traffic
 MIN_WIDTH = 0.05  # m; a lane that nowhere gets wider does not exist for its neighbours
 JUMP = 0.01  # m; where lane edges jump by more, the lane is cut
 _HERMITE = 1e-5  # m, tolerated error of cubic Hermite interpolation between samples
+_LINEAR = 5e-4  # m, tolerated error of linear interpolation of widths between samples
+_BRIDGE = 120.0  # a jump is smoothed over this multiple of it: headings are off by 1.5 / 120 rad
 _X, _W = np.polynomial.legendre.leggauss(4)
 _X, _W = (_X + 1) / 2, _W / 2
 
@@ -498,7 +500,7 @@ def sample_piece(road: RawRoad, piece: Piece, report: ImportReport) -> dict[int,
     step = np.abs(after.width - before.width).max(0, initial=0.0)
     kink = (jump > 1e-6) | (turn > 1e-5) | (step > 1e-6)
     room = (b - a) / 4
-    half = np.where(kink, np.maximum(5e-4, 20 * np.maximum(jump - 1e-5, 0.0)), 0.0)
+    half = np.where(kink, np.maximum(5e-4, _BRIDGE / 2 * np.maximum(jump - 1e-5, 0.0)), 0.0)
     half = np.minimum(half, np.minimum(room[:-1], room[1:]))
     start = a + np.concatenate([[0.0], half])
     end = b - np.concatenate([half, [0.0]])
@@ -506,7 +508,7 @@ def sample_piece(road: RawRoad, piece: Piece, report: ImportReport) -> dict[int,
         report.approximated(
             "lane geometry",
             f"road {road.id} s={s:.3f}",
-            f"jumps by {gap * 1000:.1f} mm between two records: smoothed over {40 * gap:.2f} m",
+            f"jumps by {gap * 1000:.1f} mm between two records: smoothed over {_BRIDGE * gap:.2f} m",
             road.line,
         )
 
@@ -600,8 +602,12 @@ def _intervals(shape: RoadShape, evaluate: Evaluate, start: Array, end: Array) -
     probe = evaluate(s, index)
     bend = np.abs(probe.curvature).max(0).reshape(-1, 5).max(1)
     varies = np.abs(probe.across).max(0).reshape(-1, 5).max(1) > 1e-9
+    widths = probe.width.reshape(len(probe.width), -1, 5)
+    quarter = np.maximum(end - start, 1e-9) / 4
+    flare = np.abs(np.diff(widths, 2, axis=-1)).max((0, 2)) / quarter**2  # second derivative of width
     step = np.minimum(10.0, (384 * _HERMITE / np.maximum(bend, 1e-9) ** 3) ** 0.25)
     step = np.where(varies, np.minimum(step, 1.0), step)
+    step = np.minimum(step, np.sqrt(8 * _LINEAR / np.maximum(flare, 1e-9)))
     middle = (start + end) / 2
     step = np.where(shape.road.reference.is_parametric(middle), np.minimum(step, 0.5), step)
     if not shape.road.elevation.constant:

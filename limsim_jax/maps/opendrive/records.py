@@ -477,7 +477,7 @@ class Parser:
                 case _:
                     self.ignored.add(child, where)
         if widths:
-            lane.width = Cubics(widths)
+            lane.width = Cubics(widths, backwards=True)
             self.report.read("lane width", len(widths))
             if min(w[0] for w in widths) > 1e-6:
                 self.report.repaired(
@@ -492,7 +492,7 @@ class Parser:
                     count=len(borders),
                 )
         elif borders:
-            lane.border = Cubics(borders)
+            lane.border = Cubics(borders, backwards=True)
             self.report.read("lane border", len(borders))
         elif lane.id != 0:
             self.report.repaired(
