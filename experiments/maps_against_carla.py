@@ -241,6 +241,24 @@ class OurMap:
     def _driving(self, lane: str | None) -> bool:
         return lane is not None and self.network.lanes[lane].type is LaneType.DRIVING
 
+    def beside(
+        self, marked: set[tuple[str, str, int]], stated: set[tuple[str, str, int]]
+    ) -> set[tuple[str, str, int]]:
+        """Of these (signal, road, lane): the connectors that leave a lane by which the signal is passed.
+
+        Passed it is on the way into a connector that the file names for it, or on a lane that it names.
+        """
+        ways_in: dict[str, set[str]] = {}
+        for signal, road, number in stated:
+            for lane in self.lanes.get((road, number), ()):
+                ways_in.setdefault(signal, {lane.id}).update({lane.id, *lane.predecessors})
+        return {
+            (signal, road, number)
+            for signal, road, number in marked
+            for lane in self.lanes.get((road, number), ())
+            if lane.junction is not None and ways_in.get(signal, set()) & set(lane.predecessors)
+        }
+
     def on_any_lane(self, pose: Array) -> NDArray[np.bool_]:
         """Which of these poses lie on a driving lane of ours, whatever its name, within the device's 5 cm."""
         found = np.zeros(len(pose), bool)
@@ -334,14 +352,10 @@ def compare_poses(ours: OurMap, carla_map: CarlaMap, truth: OpenDriveFormulas, r
 
     nowhere = np.isnan(fit.lateral) | (fit.lateral > DEVICE_LATERAL)
     nowhere[nowhere] = ~ours.on_any_lane(pose[nowhere])
-    bad = np.flatnonzero(fit.bad() | (fit.device > DEVICE_LATERAL))
-    carla_errs = np.zeros(len(waypoints), bool)
-    for roads in [sorted({where[i][0] for i in bad})]:
-        for road in roads:
-            rows = [i for i in bad if where[i][0] == road]
-            carla_errs[rows] = formulas_side_with_us(ours, truth, waypoints[rows], road)
-    if carla_errs.any():
-        row.exceptions.append(describe_errors(waypoints[carla_errs], names, truth, fit, carla_errs))
+    reasons = settle(ours, truth, waypoints, where, fit)
+    carla_errs = reasons != ""
+    for reason in sorted(set(reasons[carla_errs])):
+        row.exceptions.append(describe(reason, waypoints, names, truth, fit, reasons == reason))
     kept = ~carla_errs
     figures = row.figures
     figures["host"], figures["device"] = spread(fit.lateral[kept]), spread(fit.device[kept])
@@ -375,44 +389,56 @@ def places(waypoints: Array, names: dict[int, str], count: int = 3) -> str:
     return ", ".join(text) + (f" (and {len(lanes) - count} lanes more)" if len(lanes) > count else "")
 
 
-def formulas_side_with_us(
-    ours: OurMap, truth: OpenDriveFormulas, waypoints: Array, road: str
-) -> NDArray[np.bool_]:
-    """Where our lanes fit the formulas at the places of these waypoints of one road."""
-    good = np.zeros(len(waypoints), bool)
-    formulas = truth.roads[road]
-    for i, (_, section, number, s, *_) in enumerate(waypoints):
-        section, number = int(section), int(number)
-        if formulas.section_at(s) != section:  # attributed to a section that does not hold there
-            section = formulas.section_at(s)
-            if (section, number) not in formulas.lane_elements:
-                good[i] = True
-                continue
+CARLA_ERRS = "CARLA misses the formulas, ours meets them"
+NEGATIVE = "the file's width is negative: 0 in ours"
+JUMPS = "the lane jumps in the file: a short bridge in ours"
+
+
+def settle(
+    ours: OurMap, truth: OpenDriveFormulas, waypoints: Array, where: Sequence[tuple[str, int]], fit: Misfit
+) -> NDArray[np.str_]:
+    """Per waypoint of CARLA that misses our lane: why the file is on our side, or "" where it is not."""
+    reasons = np.full(len(waypoints), "", f"U{max(map(len, (CARLA_ERRS, NEGATIVE, JUMPS)))}")
+    for i in map(int, np.flatnonzero(fit.bad() | ~(fit.device < DEVICE_LATERAL))):
+        road, number = where[i]
+        s, formulas = waypoints[i, 3], truth.roads[road]
+        # CARLA may attribute a place to a section that does not hold there.
+        section = formulas.section_at(s)
+        if (section, number) not in formulas.lane_elements:
+            reasons[i] = CARLA_ERRS
+            continue
         place = formulas.lane(section, number, s)
         pose = np.stack([place.x, place.y, place.heading], -1)
-        fit = ours.misfit([(road, number)], np.array([s]), pose, place.width)
-        good[i] = not fit.bad()[0] and fit.device[0] < DEVICE_LATERAL
-    return good
+        exact = ours.misfit([(road, number)], np.array([s]), pose, place.width)
+        if not exact.bad()[0] and exact.device[0] < DEVICE_LATERAL:
+            reasons[i] = CARLA_ERRS
+        elif not place.valid[0]:
+            reasons[i] = NEGATIVE
+        elif exact.heading[0] < HEADING and exact.lateral[0] <= formulas.jump(number, s, 1.0):
+            reasons[i] = JUMPS
+    return reasons
 
 
-def describe_errors(
-    waypoints: Array, names: dict[int, str], truth: OpenDriveFormulas, fit: Misfit, which: NDArray[np.bool_]
+def describe(
+    reason: str,
+    waypoints: Array,
+    names: dict[int, str],
+    truth: OpenDriveFormulas,
+    fit: Misfit,
+    which: NDArray[np.bool_],
 ) -> str:
-    """Waypoints in which CARLA's parser misses the formulas, in words."""
-    kinds = sorted(
-        {
-            kind
-            for road in {names[int(r)] for r in waypoints[:, 0]}
-            for kind in {g.shape.tag for g in truth.roads[road].geometries}
-        }
-    )
-    lateral = fit.lateral[which]
-    worst = f"up to {1e3 * np.nanmax(lateral):.1f} mm" if np.isfinite(lateral).any() else "on another lane"
+    """Waypoints that miss our lanes for one reason, in words."""
+
+    def worst(values: Array) -> float:
+        return float(np.nanmax(values[which], initial=0.0))
+
+    roads = {names[int(r)] for r in waypoints[which, 0]}
+    kinds = sorted({g.shape.tag for road in roads for g in truth.roads[road].geometries})
+    apart = f"up to {1e3 * worst(fit.lateral):.1f} mm across the track"
     return (
-        f"CARLA misses the formulas at {len(waypoints)} waypoints ({worst} across the track, up to "
-        f"{np.degrees(np.nanmax(fit.heading[which], initial=0.0)):.2f} deg, width up to "
-        f"{1e3 * np.nanmax(fit.width[which], initial=0.0):.0f} mm; ours meets them): "
-        f"{places(waypoints, names)}; geometry there: {', '.join(kinds)}"
+        f"{which.sum()} waypoints, {reason} ({apart}, {math.degrees(worst(fit.heading)):.2f} deg, "
+        f"width {1e3 * worst(fit.width):.1f} mm): {places(waypoints[which], names)}; "
+        f"geometry: {', '.join(kinds)}"
     )
 
 
@@ -424,19 +450,22 @@ def compare_permissions(
     for ours, column, side in ((fit.may_left, 8, "left"), (fit.may_right, 9, "right")):
         known = np.isfinite(ours)
         total += int(known.sum())
-        for i in np.flatnonzero(known & (ours != waypoints[:, column])):
+        for i in map(int, np.flatnonzero(known & (ours != waypoints[:, column]))):
             road, number = where[i]
             mark = truth.roads[road].mark(int(waypoints[i, 1]), number, side == "left", waypoints[i, 3])
             differ[
                 f"{'we' if ours[i] else 'CARLA'} alone allow{'' if ours[i] else 's'} it across {mark}"
             ] += 1
-    row.figures["permission"] = {"agree": total - differ.total(), "of": total}
-    row.figures["permission"]["differ"] = dict(differ.most_common())
+    row.figures["permission"] = {
+        "agree": total - differ.total(),
+        "of": total,
+        "differ": dict(differ.most_common()),
+    }
 
 
 def compare_formulas(ours: OurMap, truth: OpenDriveFormulas, row: Comparison) -> None:
     """Our driving lanes at the formulas' places, and their length."""
-    lateral, headings, widths, device, lost, broken, count = [], [], [], [], [], 0, 0
+    lateral, headings, widths, device, lost, broken, bridged, count = [], [], [], [], [], 0, 0, 0
     for road in truth.roads.values():
         for record in road.lanes:
             length = record.s1 - record.s0
@@ -457,8 +486,12 @@ def compare_formulas(ours: OurMap, truth: OpenDriveFormulas, row: Comparison) ->
                 (lateral, fit.lateral), (headings, fit.heading), (widths, fit.width), (device, fit.device)
             ):  # fmt: skip
                 values.append(found)
-            if fit.bad().any():
-                i = np.flatnonzero(fit.bad())
+            bad = fit.bad()
+            for i in np.flatnonzero(bad & (fit.lateral > 0) & (fit.heading < HEADING) & (fit.width < WIDTH)):
+                bad[i] = fit.lateral[i] > road.jump(record.number, s[i], 1.0)
+                bridged += not bad[i]
+            if bad.any():
+                i = np.flatnonzero(bad)
                 worst = i[np.argmax(np.nan_to_num(fit.lateral[i], nan=np.inf))]
                 lost.append(
                     f"road {record.road} section {record.section} lane {record.number} s {s[worst]:.3f}"
@@ -476,6 +509,8 @@ def compare_formulas(ours: OurMap, truth: OpenDriveFormulas, row: Comparison) ->
     }
     if broken:
         row.exceptions.append(f"{broken} samples where the file's width is negative are left out")
+    if bridged:
+        row.exceptions.append(f"{bridged} samples of the formulas: {JUMPS}")
     if lost:
         row.misses.append(f"formulas missed on {len(lost)} lane records, e.g. {'; '.join(lost[:3])}")
     length = sum(lane.length for lanes in ours.lanes.values() for lane in lanes)
@@ -576,56 +611,92 @@ def difference(
         into.append(f"{title}: {'; '.join(parts)}")
 
 
-CARLA_LIGHT = "1000001"
-CARLA_SIGNS = {"206": SignKind.STOP, "205": SignKind.YIELD}
+LIGHT = "1000001"
+SIGNS = {"206": SignKind.STOP, "205": SignKind.YIELD}
 
 
 def compare_marks(ours: OurMap, carla_map: CarlaMap, truth: OpenDriveFormulas, row: Comparison) -> None:
     """Lights, stop and yield signs with the driving lanes they govern, and crosswalks."""
     network = ours.network
     names = integer_ids(truth.roads)
-    figures = row.figures
 
     def governed(marks: Iterable[Any]) -> set[tuple[str, str, int]]:
         lanes = [(mark.id, network.lanes[spot.lane]) for mark in marks for spot in mark.spots]
         return {(id_, lane.road, lane.number) for id_, lane in lanes if lane.type is LaneType.DRIVING}
 
-    if carla_map.landmarks is not None and names is not None:
-        kinds: list[tuple[str, set[str], set[tuple[str, str, int]]]] = [
-            ("lights", {CARLA_LIGHT}, governed(network.traffic_lights))
-        ]
-        for code, kind in CARLA_SIGNS.items():
-            kinds.append((f"{kind}_signs", {code}, governed(g for g in network.signs if g.kind is kind)))
-        for name, codes, mine in kinds:
-            theirs = set()
-            for mark in carla_map.landmarks:
-                if mark["type"] in codes:
-                    road = truth.roads[names[mark["road"]]]
-                    section = road.section_at(mark["s"])
-                    for lo, hi in mark["lanes"]:
-                        theirs |= {
-                            (mark["id"], road.id, n)
-                            for (i, n) in road.lane_elements
-                            if i == section
-                            and min(lo, hi) <= n <= max(lo, hi)
-                            and road.type(i, n) == "driving"
-                        }
-            figures[name] = {
-                "equal": len(mine & theirs),
-                "missing": sorted(map(str, theirs - mine)),
-                "extra": sorted(map(str, mine - theirs)),
-                "ids": len({m[0] for m in mine}),
-                "carla_ids": len({t[0] for t in theirs}),
-            }
-    if carla_map.crosswalks is not None:
-        centers = [np.mean(p[:-1], 0) for p in closed_polygons(carla_map.crosswalks)]
-        mine = [middle(c.outline) for c in network.crosswalks]
-        near = sum(any(np.hypot(*(m - c)) < 0.1 for m in mine) for c in centers)
-        figures["crosswalks"] = {"ours": len(mine), "carla": len(centers), "same_place": near}
-        if near < len(centers):
-            row.misses.append(
-                f"{len(centers) - near} of CARLA's {len(centers)} crosswalks are not where ours are"
+    stated = truth.signal_lanes()
+    light_ids = {light.id for light in network.traffic_lights}
+    for name, code, marks in (
+        ("lights", LIGHT, network.traffic_lights),
+        *((f"{k}_signs", code, [g for g in network.signs if g.kind is k]) for code, k in SIGNS.items()),
+    ):
+        mine = governed(marks)
+
+        def counts(kind: str, id_: str, code: str = code) -> bool:
+            return kind == code or (code == LIGHT and id_ in light_ids)
+
+        in_file = {(i, road, lane) for kind, i, road, lane in stated if counts(kind, i)}
+        placed = {m for m in mine - in_file if m[0] not in {i for i, _, _ in in_file}}
+        beside = ours.beside(mine - in_file - placed, in_file)
+        title = name.replace("_", " ")
+        if placed:
+            count = len({m[0] for m in placed})
+            row.exceptions.append(f"{title}: {count} name no driving lane in the file, placed by position")
+        if beside:
+            row.exceptions.append(
+                f"{title}: {len(beside)} connectors beside or behind those that the file names: {listed(beside)}"
             )
+        for word, lanes in (("missing", in_file - mine), ("extra", mine - in_file - placed - beside)):
+            if lanes:
+                row.misses.append(f"{title} on lanes, by the file, {word} {len(lanes)}: {listed(lanes)}")
+        figures = row.figures[name] = {"ids": len({mark.id for mark in marks}), "lanes": len(mine)}
+        if carla_map.landmarks is None or names is None:
+            continue
+        theirs = set[tuple[str, str, int]]()
+        for mark in carla_map.landmarks:
+            if counts(mark["type"], mark["id"]):
+                road = truth.roads[names[mark["road"]]]
+                section = road.section_at(mark["s"])
+                for n in [n for i, n in road.lane_elements if i == section and road.type(i, n) == "driving"]:
+                    if any(min(v) <= n <= max(v) for v in mark["lanes"]):
+                        theirs.add((mark["id"], road.id, n))
+        figures["as_carla"] = len(mine & theirs)
+        for word, lanes in (("misses", mine - theirs), ("adds", theirs - mine)):
+            if lanes:
+                row.exceptions.append(
+                    f"{title}: CARLA {word} {len(lanes)} lanes where ours are as in the file: {listed(lanes)}"
+                )
+    compare_crosswalks(ours, carla_map, truth, row)
+
+
+def listed(lanes: Iterable[tuple[str, str, int]]) -> str:
+    """A few (signal, road, lane) in words."""
+    lanes = sorted(lanes)
+    text = ", ".join(f"signal {i} on road {road} lane {lane}" for i, road, lane in lanes[:3])
+    return text + (", ..." if len(lanes) > 3 else "")
+
+
+def compare_crosswalks(ours: OurMap, carla_map: CarlaMap, truth: OpenDriveFormulas, row: Comparison) -> None:
+    """Centres of the crosswalks."""
+
+    def near(a: Array, places: Sequence[Array]) -> bool:
+        return any(np.hypot(*(a - b)) < 0.05 for b in places)
+
+    mine = [middle(c.outline) for c in ours.network.crosswalks]
+    exact = truth.crosswalk_centers()
+    lost = sum(not near(place, mine) for place, _ in exact)
+    if lost:
+        row.misses.append(f"{lost} of {len(exact)} crosswalks are not where the file puts them")
+    figures = row.figures["crosswalks"] = {"ours": len(mine), "file": len(exact)}
+    if carla_map.crosswalks is None:
+        return
+    theirs = [np.mean(p[:-1], 0) for p in closed_polygons(carla_map.crosswalks)]
+    figures["carla"], figures["as_carla"] = len(theirs), sum(near(place, mine) for place in theirs)
+    shifted = sum(near(place, [b for _, b in exact]) and not near(place, mine) for place in theirs)
+    if shifted:
+        row.exceptions.append(f"{shifted} crosswalks that CARLA shifts by the lane offset of their road")
+    if figures["as_carla"] + shifted < len(theirs):
+        row.misses.append(f"{len(theirs) - shifted - figures['as_carla']} crosswalks of CARLA are not ours")
 
 
 def middle(outline: Array) -> Array:
@@ -685,7 +756,8 @@ def markdown(rows: Sequence[Comparison], command: str) -> str:
         "listed below the table and left out of the figures. *To formulas*: driving lanes of ours against",
         "direct evaluation, every metre, also where CARLA gives no answer. *Length error*: summed driving",
         "lanes against quadrature of the formulas. Thresholds: host 1 mm, device 50 mm (median 10 mm),",
-        "heading 1 degree, width 10 mm, length 0.1 %, equal movements at every junction.",
+        "heading 1 degree, width 10 mm, length 0.1 %, equal movements at every junction. Lane change (over",
+        "waypoints), lights and signs (over lanes that they govern), crosswalks: as CARLA has it, of ours.",
         "",
         "| " + " | ".join(heads) + " |",
         "|" + "---|" * len(heads),
@@ -698,13 +770,10 @@ def markdown(rows: Sequence[Comparison], command: str) -> str:
             return " / ".join(number(v, 3) for v in f.get(name, empty).values())
 
         def marks(name: str, f: dict[str, Any] = f) -> str:
-            m = f.get(name)
-            if m is None:
-                return "-"
-            text = f"{m['equal']} equal"
-            return text + "".join(f", {len(m[k])} {k}" for k in ("missing", "extra") if m[k])
+            m = f[name]
+            return f"{m.get('as_carla', '-')} of {m['lanes']}" if m["lanes"] else "0"
 
-        allowed, walks = f.get("permission"), f.get("crosswalks")
+        allowed, walks = f.get("permission"), f["crosswalks"]
         cells = [
             row.map,
             row.verdict,
@@ -724,7 +793,7 @@ def markdown(rows: Sequence[Comparison], command: str) -> str:
             "-" if not allowed else f"{allowed['agree']} of {allowed['of']}",
             marks("lights"),
             f"{marks('stop_signs')} / {marks('yield_signs')}",
-            "-" if not walks else f"{walks['same_place']} of {walks['carla']} ({walks['ours']} ours)",
+            f"{walks.get('as_carla', '-')} of {walks['ours']}" if walks["ours"] else "0",
         ]
         lines.append("| " + " | ".join(cells) + " |")
     lines += ["", "## Differences, and what settles them", ""]
@@ -733,15 +802,6 @@ def markdown(rows: Sequence[Comparison], command: str) -> str:
         notes += [f"MISS: {text}" for text in row.misses] + list(row.exceptions)
         permission = row.figures.get("permission", {}).get("differ", {})
         notes += [f"lane change, {count} waypoints: {text}" for text, count in permission.items()]
-        for kind in ("lights", "stop_signs", "yield_signs"):
-            for word in ("missing", "extra"):
-                listed = row.figures.get(kind, {}).get(word, [])
-                if listed:
-                    more = f" and {len(listed) - 4} more" if len(listed) > 4 else ""
-                    title = kind.replace("_", " ")
-                    notes.append(
-                        f"{title} {word} against CARLA (id, road, lane): {' '.join(listed[:4])}{more}"
-                    )
         notes += [f"CARLA prints: {line}" for line in dict.fromkeys(row.said)]
         if notes:
             lines += [f"**{row.map}**", "", *(f"- {note}" for note in notes), ""]

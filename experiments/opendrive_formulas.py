@@ -320,6 +320,23 @@ class RoadFormulas:
         change = mark.get("laneChange")
         return f"{mark.get('type')}, " + ("laneChange absent" if change is None else f"laneChange={change}")
 
+    def jump(self, number: int, s: float, reach: float) -> float:
+        """Largest gap (m) that the file leaves in a lane's centre line within `reach` of `s`."""
+        side = 1 if number > 0 else -1
+        knots = {g.s0 for g in self.geometries} | set(self.offset.s0.tolist()) | set(self.starts)
+        for (section, n), (records, _) in self._profiles.items():
+            if n * side > 0 and abs(n) <= abs(number):
+                knots |= {self.starts[section] + float(b) for b in records.s0}
+        largest = 0.0
+        for knot in knots:
+            before, after = max(knot - 1e-7, 0.0), min(knot + 1e-7, self.length)
+            sections = self.section_at(before), self.section_at(after)
+            if abs(knot - s) > reach or any((i, number) not in self.lane_elements for i in sections):
+                continue
+            a, b = (self.lane(i, number, at) for i, at in zip(sections, (before, after), strict=True))
+            largest = max(largest, float(np.hypot(a.x - b.x, a.y - b.y)[0]) - 1e-6)
+        return largest
+
     def lane_length(self, record: LaneRecord) -> float:
         """Arc length of a lane centre: Gauss-Legendre between all places where a record changes."""
         breaks = {record.s0, record.s1}
@@ -361,6 +378,64 @@ class OpenDriveFormulas:
     def driving_length(self) -> float:
         """Summed arc length of the driving lanes, m."""
         return sum(self.roads[lane.road].lane_length(lane) for lane in self.driving_lanes())
+
+    def signal_lanes(self) -> list[tuple[str, str, str, int]]:
+        """(type, id, road, lane number) of the driving lanes that signals and their references govern.
+
+        Lanes of the validity records, or, without these, of the direction that `orientation` gives.
+        """
+        kinds = {signal.get("id"): signal.get("type", "") for signal in self.root.iter("signal")}
+        found = []
+        for road in self.roads.values():
+            for signal in road.element.iterfind("signals/*"):
+                if signal.tag not in ("signal", "signalReference"):
+                    continue
+                kind = signal.get("type", "") if signal.tag == "signal" else kinds.get(signal.get("id"), "")
+                section = road.section_at(min(max(_number(signal, "s"), 0.0), road.length))
+                ranges = [
+                    sorted((int(v.get("fromLane", "0")), int(v.get("toLane", "0"))))
+                    for v in signal.iterfind("validity")
+                ]
+                way = signal.get("orientation", "none")
+                for i, number in road.lane_elements:
+                    if i != section or number == 0 or road.type(i, number) != "driving":
+                        continue
+                    if (
+                        any(lo <= number <= hi for lo, hi in ranges)
+                        if ranges
+                        else way not in ("+", "-") or road.runs_with_s(number) == (way == "+")
+                    ):
+                        found.append((kind, signal.get("id", ""), road.id, number))
+        return found
+
+    def crosswalk_centers(self) -> list[tuple[Array, Array]]:
+        """Mean corner of every crosswalk outline, and the same with the lane offset added to its `t`.
+
+        `t` is measured from the reference line (OpenDRIVE 1.8, 7.3), to which the lane offset adds nothing.
+        """
+        found = []
+        for road in self.roads.values():
+            for thing in road.element.iterfind("objects/object"):
+                corners = [(_number(c, "u"), _number(c, "v")) for c in thing.iter("cornerLocal")]
+                if thing.get("type") != "crosswalk" or not corners:
+                    continue
+                if len(corners) > 1 and np.allclose(corners[0], corners[-1]):
+                    corners = corners[:-1]
+                x, y, heading, _, _ = (v[0] for v in road.reference(_number(thing, "s")))
+                u, v = np.mean(corners, 0)
+                turn = heading + _number(thing, "hdg")
+                shift = road.offset(np.array([_number(thing, "s")]))[0][0]
+                places = [
+                    np.array(
+                        [
+                            x - t * math.sin(heading) + u * math.cos(turn) - v * math.sin(turn),
+                            y + t * math.cos(heading) + u * math.sin(turn) + v * math.cos(turn),
+                        ]
+                    )
+                    for t in (_number(thing, "t"), _number(thing, "t") + shift)
+                ]
+                found.append((places[0], places[1]))
+        return found
 
     def junction_ids(self) -> list[str]:
         """Ids of the junctions, in the order of the file."""
