@@ -1,0 +1,453 @@
+"""Routes as tables: for every lane and goal, which lane comes next and which lane to be in by when.
+
+A vehicle carries one number, its goal; where it stands, the tables say how far it is, which
+successor to take, how many lanes to cross and by where. Built on the host in float64 with Dijkstra's
+algorithm on the reversed lane graph, from all goals at once.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import flax.struct
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from limsim_jax.maps.network import Lane, MapError, Network
+
+Array = np.ndarray | jax.Array
+Floats = NDArray[np.float64]
+
+FAR = 1e9
+"""Distance (m) to what cannot be reached, or to a lane change that is not needed."""
+
+CHANGE_PENALTY = 30.0
+"""Metres of detour that are preferred to one lane change."""
+
+TOLERANCE = 5.0
+"""Metres by which lanes that lead to the same place may differ in length and still be equally good."""
+
+
+@flax.struct.dataclass(kw_only=True)
+class RouteTable:
+    """The way from every lane to every goal: `L - 1` lanes and, last, the null lane; `G` goals.
+
+    The null lane reaches nothing. Take two lanes of 100 m, A on the right and B on the left, of which
+    only B leads on, to C (50 m), the goal; lane changes are allowed and cost 30 m:
+
+    ====  ========  =========  ===========  ===============  =======
+    lane  distance  next_lane  lanes_to_go  change_distance  is_goal
+    ====  ========  =========  ===========  ===============  =======
+    A     180       -1         1            100              False
+    B     150       C          0            1e9              False
+    C     50        -1         0            1e9              True
+    ====  ========  =========  ===========  ===============  =======
+
+    A vehicle at s = 80 m on A has one lane to cross to the left and 100 - 80 = 20 m left to do so.
+    Were there another pair of lanes like A and B before these, the one that leads to A would have the
+    same `lanes_to_go` and `change_distance` 200: the change can be put off until the end of A.
+    """
+
+    distance: Float[Array, "L G"]
+    """Cost to go, m: from the start of the lane to the end of the goal lane, with `CHANGE_PENALTY`
+    for every lane change; lanes side by side count with their mean length. 1e9 if unreachable."""
+    next_lane: Int[Array, "L G"]
+    """Best successor for a vehicle that stays in this lane to its end; -1 on goal lanes, and where the
+    goal cannot be reached without changing lanes before that."""
+    lanes_to_go: Int[Array, "L G"]
+    """Lanes to cross (+ to the left, - to the right) the next time that the best route must change
+    lanes; 0 if it never has to. Changes are put off as long as that costs nothing."""
+    change_distance: Float[Array, "L G"]
+    """From the start of this lane to the end of the last lane on which that change is possible, m;
+    1e9 if `lanes_to_go` is 0. Subtract the vehicle's s."""
+    reachable: Bool[Array, "L G"]
+    is_goal: Bool[Array, "L G"]
+
+    def pad(self, *, lanes: int, goals: int) -> RouteTable:
+        """The same table with this many rows (null rows included) and goals; new goals are unreachable.
+
+        Raises `ValueError` if the table does not fit.
+        """
+        rows, columns = self.distance.shape
+        if lanes < rows or goals < columns:
+            raise ValueError(f"a table of {rows} x {columns} does not fit into {lanes} x {goals}")
+        fills = {"distance": FAR, "next_lane": -1, "change_distance": FAR}
+        return RouteTable(
+            **{
+                name: np.pad(
+                    np.asarray(x),
+                    ((0, lanes - rows), (0, goals - columns)),
+                    constant_values=fills.get(name, 0),
+                )
+                for name, x in vars(self).items()
+            }
+        )
+
+
+def default_goals(network: Network) -> dict[str, tuple[str, ...]]:
+    """The ways out of a map: groups of lane ids by name.
+
+    One goal per road and direction on which traffic leaves the map: the last lanes, none of which has
+    a drivable successor. (A lane that ends beside one that goes on is no exit.) A map without exits
+    (closed loops) has one goal per road and direction outside junctions instead: the last lanes on it.
+    Names are road ids, with `+` or `-` for the sign of the lane numbers where a road has traffic both
+    ways (OpenDRIVE).
+    """
+    lanes = {lane.id: lane for lane in network.drivable_lanes()}
+    go_on = {_carriageway(lane) for lane in lanes.values() if any(name in lanes for name in lane.successors)}
+    ends = [lane for lane in lanes.values() if _carriageway(lane) not in go_on]
+    if not ends:
+        ends = [
+            lane
+            for lane in lanes.values()
+            if lane.junction is None
+            and not any(lanes[x].road == lane.road for x in lane.successors if x in lanes)
+        ]
+    ways = {(lane.road, lane.number < 0) for lane in lanes.values()}
+    goals: dict[str, tuple[str, ...]] = {}
+    for lane in ends:
+        both = {(lane.road, True), (lane.road, False)} <= ways
+        name = lane.road + (("-" if lane.number < 0 else "+") if both else "")
+        goals[name] = (*goals.get(name, ()), lane.id)
+    return goals
+
+
+def _carriageway(lane: Lane) -> tuple[str, int, bool]:
+    """Lanes with the same key lie side by side in the same direction."""
+    return lane.road, lane.section, lane.number < 0
+
+
+def build_routes(
+    network: Network,
+    rows: Mapping[str, int],
+    goals: Sequence[Sequence[str]] | Mapping[str, Sequence[str]] | None = None,
+    *,
+    vehicle_class: str | None = None,
+    change_penalty: float = CHANGE_PENALTY,
+    tolerance: float = TOLERANCE,
+) -> RouteTable:
+    """Tables of the way from every lane to every goal.
+
+    Args:
+        network: The map.
+        rows: Row of every drivable lane (`lane_map.lane_rows`).
+        goals: Groups of lane ids; a goal is reached at the end of any lane of its group. Default:
+            `default_goals`.
+        vehicle_class: Use only lanes that this class may use. Default: all drivable lanes.
+        change_penalty: Cost of one lane change, m.
+        tolerance: Prefer staying in the lane if it is at most this much longer, m.
+
+    Raises:
+        MapError: a goal without lanes, or with one that is not a drivable lane of the map.
+    """
+    if goals is None:
+        goals = default_goals(network)
+    groups = list(goals.values()) if isinstance(goals, Mapping) else list(goals)
+    for group in groups:
+        if isinstance(group, str) or not group:
+            raise MapError(f"a goal is a group of one or more lane ids, not {group!r}", file=network.source)
+        for name in group:
+            if name not in rows:
+                raise MapError(_no_such_lane(network, name), file=network.source, element=f"goal {name!r}")
+    graph = _LaneGraph(network, rows, vehicle_class)
+    return graph.solve([[rows[name] for name in group] for group in groups], change_penalty, tolerance)
+
+
+def build_fixed_routes(
+    network: Network,
+    rows: Mapping[str, int],
+    routes: Sequence[Sequence[str]],
+    *,
+    vehicle_class: str | None = None,
+    change_penalty: float = CHANGE_PENALTY,
+    tolerance: float = TOLERANCE,
+) -> RouteTable:
+    """Tables for routes that prescribe every road (SUMO edges): one column per route.
+
+    A column knows only the lanes of its roads, and the connectors between one road and the next; its
+    goal is the end of the last road. Cut routes that visit a road twice with `split_route`: the
+    vehicle then goes on to the column of the next leg.
+
+    Raises:
+        MapError: a road that is not on the map, comes twice in a route, or from which no lane leads to
+            the next one.
+    """
+    graph = _LaneGraph(network, rows, vehicle_class)
+    columns = []
+    for roads in routes:
+        links = graph.along(_checked_route(network, roads, vehicle_class))
+        ends = [rows[lane.id] for lane in graph.ends(roads[-1])]
+        column = graph.solve([ends], change_penalty, tolerance, links)
+        for road, after in itertools.pairwise(roads):
+            if not any(column.next_lane[rows[lane.id], 0] >= 0 for lane in graph.ends(road)):
+                raise _dead_end(network, road, after, roads[-1])
+        columns.append(column)
+    if not columns:
+        return graph.solve([], change_penalty, tolerance)
+    return RouteTable(**{name: np.hstack([vars(c)[name] for c in columns]) for name in vars(columns[0])})
+
+
+def split_route(roads: Sequence[str]) -> list[tuple[str, ...]]:
+    """Cut a list of roads into legs without repetition; each begins with the last road of the one before.
+
+    `["a", "b", "a", "c"]` becomes `[("a", "b"), ("b", "a", "c")]`.
+    """
+    legs: list[list[str]] = [[]]
+    for road in roads:
+        if road in legs[-1]:
+            legs.append([legs[-1][-1]])
+        legs[-1].append(road)
+    return [tuple(leg) for leg in legs]
+
+
+def route_lanes(
+    network: Network, roads: Sequence[str], *, vehicle_class: str | None = None
+) -> tuple[tuple[str, ...], ...]:
+    """For every road of a route, the ids of its last lanes from which the rest of the route can be driven.
+
+    Lane changes are allowed where the map allows them, on any road of the route. On the last road all
+    lanes qualify. Raises `MapError` as `build_fixed_routes` does; roads may come twice.
+    """
+    found: list[tuple[str, ...]] = []
+    lanes = list(network.drivable_lanes())
+    rows = {lane.id: i for i, lane in enumerate(lanes)}
+    graph = _LaneGraph(network, rows, vehicle_class)
+    _checked_route(network, roads, vehicle_class, repeats=True)
+    wanted = [lane.id for lane in graph.ends(roads[-1])]
+    found.append(tuple(wanted))
+    for road, after in reversed(list(itertools.pairwise(roads))):
+        table = graph.solve([[rows[name] for name in wanted]], 1.0, 0.0, graph.along((road, after)))
+        leads_on = [x for x in graph.ends(road) if table.next_lane[rows[x.id], 0] >= 0]
+        if not leads_on:
+            raise _dead_end(network, road, after, roads[-1])
+        wanted = [lane.id for lane in leads_on]
+        found.append(tuple(wanted))
+    return tuple(reversed(found))
+
+
+def require_reachable(network: Network, table: RouteTable, start: str, goal: int) -> None:
+    """Raise a `MapError` that names both ends unless goal number `goal` can be reached from lane `start`."""
+    lanes = list(network.drivable_lanes())
+    row = next((i for i, lane in enumerate(lanes) if lane.id == start), None)
+    if row is None:
+        raise MapError(_no_such_lane(network, start), file=network.source)
+    if not 0 <= goal < table.distance.shape[1]:
+        raise MapError(f"no goal {goal}; there are {table.distance.shape[1]}", file=network.source)
+    if not table.reachable[row, goal]:
+        ends = [lane for i, lane in enumerate(lanes) if table.is_goal[i, goal]]
+        roads = ", ".join(dict.fromkeys(f"'{lane.road}'" for lane in ends)) or "nowhere"
+        raise MapError(
+            f"no way from lane '{start}' (road '{lanes[row].road}') to goal {goal} (road {roads})",
+            file=network.source,
+        )
+
+
+def _dead_end(network: Network, road: str, after: str, last: str) -> MapError:
+    return MapError(f"no lane from road '{road}' leads to '{after}' and on to '{last}'", file=network.source)
+
+
+def _no_such_lane(network: Network, name: str) -> str:
+    if name in network.lanes:
+        return f"lane '{name}' is not for motor traffic"
+    return f"no lane '{name}'; ids look like {', '.join(list(network.lanes)[:5])}"
+
+
+def _checked_route(
+    network: Network, roads: Sequence[str], vehicle_class: str | None, *, repeats: bool = False
+) -> tuple[str, ...]:
+    """The route, if every road is there, has a lane to drive on, and comes once."""
+    if not roads:
+        raise MapError("a route needs at least one road", file=network.source)
+    usable = {lane.road for lane in network.drivable_lanes() if _may_use(lane, vehicle_class)}
+    for road in roads:
+        if road not in usable:
+            network.road_lanes(road)  # raises if there is none of this name
+            who = vehicle_class or "motor traffic"
+            raise MapError(f"no lane of road '{road}' is for {who}", file=network.source)
+    if not repeats and len(set(roads)) < len(roads):
+        twice = next(road for road in roads if list(roads).count(road) > 1)
+        raise MapError(f"the route visits road '{twice}' twice; cut it with split_route", file=network.source)
+    return tuple(roads)
+
+
+def _may_use(lane: Lane, vehicle_class: str | None) -> bool:
+    return vehicle_class is None or vehicle_class in lane.access
+
+
+class _LaneGraph:
+    """Lanes by row, and the links between them: to successors, to the left, to the right."""
+
+    def __init__(self, network: Network, rows: Mapping[str, int], vehicle_class: str | None) -> None:
+        self.network, self.rows = network, rows
+        self.lanes = sorted(network.drivable_lanes(), key=lambda lane: rows[lane.id])
+        usable = {lane.id: rows[lane.id] for lane in self.lanes if _may_use(lane, vehicle_class)}
+        self.usable = usable
+
+        def links(pairs: list[tuple[str, str | None]]) -> NDArray[np.int_]:
+            found = [(usable[a], usable[b]) for a, b in pairs if a in usable and b in usable]
+            return np.array(found, int).reshape(-1, 2)
+
+        self.ahead = links([(lane.id, name) for lane in self.lanes for name in lane.successors])
+        self.left = links([(lane.id, lane.left) for lane in self.lanes if lane.may_change_left])
+        self.right = links([(lane.id, lane.right) for lane in self.lanes if lane.may_change_right])
+        # Lanes side by side count with their mean length: else a route would change lanes at every
+        # bend to save some metres, and long before it must.
+        beside = links([(lane.id, name) for lane in self.lanes for name in (lane.left, lane.right)])
+        size = len(self.lanes)
+        group = connected_components(_matrix(beside, np.ones(len(beside)), size), directed=False)[1]
+        self.length = np.array([lane.length for lane in self.lanes])
+        self.cost = (np.bincount(group, self.length) / np.maximum(np.bincount(group), 1))[group]
+
+    def ends(self, road: str) -> list[Lane]:
+        """Lanes of a road from which no lane of the same road follows."""
+        return [
+            lane
+            for lane in self.lanes
+            if lane.road == road
+            and lane.id in self.usable
+            and all(
+                self.network.lanes[name].road != road
+                for name in lane.successors
+                if name in self.network.lanes
+            )
+        ]
+
+    def along(self, roads: Sequence[str]) -> NDArray[np.bool_]:
+        """Which of the links ahead belong to a route over these roads: a mask over `ahead`."""
+        order = {road: i for i, road in enumerate(roads)}
+        place = np.array([order.get(lane.road, -1) for lane in self.lanes])
+        inside = np.array([lane.junction is not None for lane in self.lanes]) & (place < 0)
+        tail, head = self.ahead.T
+        allowed = (place[tail] >= 0) & ((place[head] == place[tail]) | (place[head] == place[tail] + 1))
+        # A connector serves the step from road i to i + 1 if it can be entered from the one and leads
+        # to the other by way of such connectors. Lanes on no path cost nothing.
+        for i in range(len(roads) - 1):
+            reached = _closure(place == i, tail, head, inside)
+            leads = _closure(place == i + 1, head, tail, inside)
+            via = inside & reached & leads
+            enters, stays, leaves = (
+                (place[tail] == i) & via[head],
+                via[tail] & via[head],
+                via[tail] & (place[head] == i + 1),
+            )
+            allowed |= enters | stays | leaves
+        return allowed
+
+    def solve(
+        self,
+        goals: Sequence[Sequence[int]],
+        change_penalty: float,
+        tolerance: float,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> RouteTable:
+        """The tables, with one row more for the null lane. `mask` keeps some of the links ahead."""
+        size, count = len(self.lanes), len(goals)
+        ahead = self.ahead if mask is None else self.ahead[mask]
+        is_goal = np.zeros((size, count), bool)
+        for g, members in enumerate(goals):
+            is_goal[[row for row in members if self.lanes[row].id in self.usable], g] = True
+
+        # Reversed links, and from every goal (a node of its own) to the ends of its lanes.
+        row, goal = np.nonzero(is_goal)
+        links = np.concatenate([ahead, self.left, self.right, np.column_stack([row, size + goal])])
+        changes = np.full(len(self.left) + len(self.right), max(change_penalty, 1e-6))
+        costs = np.concatenate([self.cost[ahead[:, 0]], changes, self.cost[row]])
+        graph = _matrix(links[:, ::-1], np.maximum(costs, 1e-6), size + count)
+        cost = np.full((size, count), np.inf)
+        if count:
+            cost = dijkstra(graph, indices=size + np.arange(count))[:, :size].T
+
+        def best(pairs: NDArray[np.int_]) -> tuple[Floats, NDArray[np.int_]]:
+            """Least cost behind the links of each lane, and the lane there."""
+            least, which = np.full((size, count), np.inf), np.full((size, count), -1)
+            if not len(pairs):
+                return least, which
+            for n in range(int(np.bincount(pairs[:, 0]).max())):
+                nth = _nth_of_each(pairs, n)
+                tail, head = nth.T
+                better = cost[head] < least[tail]
+                which[tail] = np.where(better, head[:, None], which[tail])
+                least[tail] = np.where(better, cost[head], least[tail])
+            return least, which
+
+        behind, next_lane = best(ahead)
+        next_lane[is_goal] = -1
+        own = self.cost[:, None]
+        straight = np.where(is_goal, own, own + behind)
+        # A lane is stayed in where that costs (almost) nothing; half of its length at most, so that
+        # the cost to go falls along the way.
+        stays = straight <= cost + np.minimum(tolerance, 0.5 * own) + 1e-6
+        cost_left, to_left = best(self.left)
+        cost_right, to_right = best(self.right)
+        reachable = np.isfinite(cost)
+        changes_left = reachable & ~stays & (cost_left < cost_right)
+        changes_right = reachable & ~stays & ~changes_left
+
+        # Go straight on, in jumps that double, to the lane where a change is due.
+        itself = np.broadcast_to(np.arange(size)[:, None], (size, count))
+        moves = reachable & stays & ~is_goal
+        at = np.where(moves, next_lane, itself)
+        passed = np.where(moves, self.length[:, None], 0.0)
+        columns = np.broadcast_to(np.arange(count), (size, count))
+        while True:
+            further = at[at, columns]
+            if (further == at).all():
+                break
+            passed, at = passed + passed[at, columns], further
+        # Count the changes that follow each other on the lanes beside it.
+        aside, lane = np.zeros((size, count), int), itself
+        step = np.where(changes_left, 1, np.where(changes_right, -1, 0))
+        beside = np.where(changes_left, to_left, np.where(changes_right, to_right, itself))
+        direction = step
+        while True:
+            going_on = (step[lane, columns] == direction) & (direction != 0)
+            if not going_on.any():
+                break
+            aside, lane = aside + going_on * direction, np.where(going_on, beside[lane, columns], lane)
+        lanes_to_go = aside[at, columns]
+        due = lanes_to_go != 0
+        table = RouteTable(
+            distance=np.where(reachable, cost, FAR).astype(np.float32),
+            next_lane=next_lane.astype(np.int32),
+            lanes_to_go=lanes_to_go.astype(np.int32),
+            change_distance=np.where(due, passed + self.length[at], FAR).astype(np.float32),
+            reachable=reachable,
+            is_goal=is_goal,
+        )
+        return table.pad(lanes=size + 1, goals=count)
+
+
+def _matrix(links: NDArray[np.int_], costs: Floats, size: int) -> csr_array:
+    """Sparse adjacency matrix; of parallel links the cheapest counts."""
+    order = np.lexsort((costs, links[:, 1], links[:, 0]))
+    links, costs = links[order], costs[order]
+    first = np.ones(len(links), bool)
+    first[1:] = (links[1:] != links[:-1]).any(1)
+    return csr_array((costs[first], (links[first, 0], links[first, 1])), shape=(size, size))
+
+
+def _nth_of_each(pairs: NDArray[np.int_], n: int) -> NDArray[np.int_]:
+    """The n-th link of every lane that has so many."""
+    order = np.argsort(pairs[:, 0], kind="stable")
+    pairs = pairs[order]
+    first = np.searchsorted(pairs[:, 0], pairs[:, 0])
+    return pairs[np.arange(len(pairs)) - first == n]
+
+
+def _closure(
+    start: NDArray[np.bool_], tail: NDArray[np.int_], head: NDArray[np.int_], within: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Nodes of `within` that are reached from `start` by links tail -> head over nodes of `within`."""
+    reached = start.copy()
+    while True:
+        more = np.zeros_like(reached)
+        more[head[reached[tail]]] = True
+        more &= within & ~reached
+        if not more.any():
+            return reached & within
+        reached |= more
