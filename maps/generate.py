@@ -15,6 +15,7 @@ a platform's `sin`.
 from __future__ import annotations
 
 import argparse
+import functools
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -90,9 +91,14 @@ class Curve:
     """A reference line: pieces one after another."""
 
     def __init__(self, start: Pose, pieces: Sequence[Piece]) -> None:
-        rounded = (Piece(round(p.length, 6), p.k0, p.k1) for p in pieces)
+        kept: list[Piece] = []
+        for length, k0, k1 in pieces:
+            if kept and k0 == k1 == kept[-1].k0 == kept[-1].k1:
+                kept[-1] = Piece(round(kept[-1].length + length, 6), k0, k1)
+            elif length > 1e-4:
+                kept.append(Piece(round(length, 6), k0, k1))
         self.start = start
-        self.pieces = tuple(p for p in rounded if p.length > 1e-4)
+        self.pieces = tuple(kept)
         self.length = round(sum(p.length for p in self.pieces), 6)
 
     def records(self) -> Iterator[tuple[float, Pose, Piece]]:
@@ -149,14 +155,14 @@ def arc(radius: float, degrees: float, clothoid: float) -> list[Piece]:
 def bend(angle: float, tangent: float) -> list[Piece]:
     """The clothoid-arc-clothoid turn by `angle` whose legs to the corner are `tangent` long.
 
-    Half of the angle falls to the clothoids. All such turns are similar, so the unit one is scaled.
+    A quarter of the angle falls to the clothoids. All such turns are similar: the unit one is scaled.
     """
     if abs(angle) < 1e-9:
         return [Piece(2 * tangent)]
-    k = math.copysign(1.0, angle)
-    unit = [Piece(abs(angle) / 2, 0, k), Piece(abs(angle) / 2, k, k), Piece(abs(angle) / 2, k, 0)]
-    x, y, _ = Curve(Pose(0, 0, 0), unit).end
-    radius = tangent / (x - y / math.tan(angle))
+    k, quarter = math.copysign(1.0, angle), abs(angle) / 4
+    unit = [Piece(quarter, 0, k), Piece(3 * quarter, k, k), Piece(quarter, k, 0)]
+    end = functools.reduce(advance, unit, Pose(0, 0, 0))
+    radius = tangent / (end.x - end.y / math.tan(angle))
     return [Piece(p.length * radius, p.k0 / radius, p.k1 / radius) for p in unit]
 
 
@@ -198,6 +204,7 @@ class Profile:
         return (self.knots[0][1] if s < self.knots[0][0] else self.knots[-1][1], 0, 0, 0)
 
     def __call__(self, s: float) -> float:
+        """The value at `s`."""
         return self.cubic(s)[0]
 
     def records(self, s0: float, s1: float) -> Iterator[tuple[float, tuple[float, float, float, float]]]:
@@ -235,6 +242,7 @@ class Lane(NamedTuple):
     speed: float | None = None  # where it differs from the road's
 
     def profile(self) -> Profile:
+        """The width along the road."""
         return self.width if isinstance(self.width, Profile) else Profile((0, self.width))
 
 
@@ -277,10 +285,12 @@ class Road:
 
     @property
     def start(self) -> Contact:
+        """The end of the road where s = 0."""
         return Contact(self, "start")
 
     @property
     def end(self) -> Contact:
+        """The end of the road where s is its length."""
         return Contact(self, "end")
 
 
@@ -292,10 +302,12 @@ class Contact(NamedTuple):
 
     @property
     def s(self) -> float:
+        """Where it is along the road."""
         return 0.0 if self.at == "start" else self.road.curve.length
 
     @property
     def section(self) -> Section:
+        """The first or last lane section."""
         return self.road.sections[0 if self.at == "start" else -1]
 
     def leaving(self, keys: Sequence[str]) -> list[int]:
@@ -309,7 +321,8 @@ class Contact(NamedTuple):
     def keys(self, *, leaving: bool, kind: str = "driving") -> list[str]:
         """Lanes of a kind whose traffic leaves (or enters) the road here, from the left."""
         right = leaving == (self.at == "end")
-        return [lane.key for lane in (self.section.right if right else self.section.left) if lane.kind == kind]
+        lanes = self.section.right if right else self.section.left
+        return [lane.key for lane in lanes if lane.kind == kind]
 
     def _numbers(self, keys: Sequence[str], *, right: bool) -> list[int]:
         lanes = [lane.key for lane in (self.section.right if right else self.section.left)]
@@ -318,10 +331,12 @@ class Contact(NamedTuple):
         return [(-1 if right else 1) * (lanes.index(k) + 1) for k in keys]
 
     def lane(self, number: int) -> Lane:
+        """The lane with this number."""
         side = self.section.right if number < 0 else self.section.left
         return side[abs(number) - 1]
 
     def width(self, number: int) -> float:
+        """The width of a lane here."""
         return self.lane(number).profile()(self.s)
 
     def t(self, number: int, across: float = 0.0) -> float:
@@ -440,7 +455,6 @@ class Map:
         self.roads: list[Road] = []
         self.junctions: list[Junction] = []
         self.controllers: list[tuple[str, Sequence[int]]] = []
-        self.roundabouts: list[tuple[str, list[Junction]]] = []
         self.items = 0  # signals and objects so far
 
     def road(
@@ -477,18 +491,18 @@ class Map:
         self.attach(b, a)
 
     def new_id(self) -> int:
+        """A number for a signal or an object."""
         self.items += 1
         return self.items
 
     def controller(self, name: str, lights: Sequence[int]) -> int:
+        """Add a signal group; its number."""
         self.controllers.append((name, lights))
         return len(self.controllers)
 
     # ------------------------------------------------------------------------- things on the road
 
-    def signal(
-        self, contact: Contact, back: float, lanes: Sequence[str], t: float, **attributes: str
-    ) -> int:
+    def signal(self, contact: Contact, back: float, lanes: Sequence[str], t: float, **attributes: str) -> int:
         """Add a signal for traffic that leaves the road at `contact`, `back` metres before it does."""
         at_end = contact.at == "end"
         number = self.new_id()
@@ -496,8 +510,8 @@ class Map:
         element.set("s", text(contact.s - back if at_end else back))
         element.set("t", text(t))
         element.set("orientation", "+" if at_end else "-")
-        defaults = {"dynamic": "no", "country": "DE", "countryRevision": "2017", "subtype": "-1", "zOffset": "2"}
-        for key, value in (defaults | attributes).items():
+        defaults = {"dynamic": "no", "country": "DE", "countryRevision": "2017", "subtype": "-1"}
+        for key, value in (defaults | {"zOffset": "2"} | attributes).items():
             element.set(key, value)
         numbers = sorted(contact.leaving(lanes))
         etree.SubElement(element, "validity", fromLane=str(numbers[0]), toLane=str(numbers[-1]))
@@ -509,10 +523,19 @@ class Map:
         numbers = contact.leaving(lanes)
         t = 0.5 * (contact.t(numbers[0]) + contact.t(numbers[-1], 1.0))
         return self.signal(
-            contact, back, lanes, t,
-            name=f"light {contact.road.name} {'+'.join(lanes)}", dynamic="yes", country="OpenDRIVE",
-            countryRevision="", type="1000001", zOffset="5.2", height="0.9", width="0.3",
-        )  # fmt: skip
+            contact,
+            back,
+            lanes,
+            t,
+            name=f"light {contact.road.name} {'+'.join(lanes)}",
+            dynamic="yes",
+            country="OpenDRIVE",
+            countryRevision="",
+            type="1000001",
+            zOffset="5.2",
+            height="0.9",
+            width="0.3",
+        )
 
     def sign(self, contact: Contact, back: float, lanes: Sequence[str], kind: str, **attributes: str) -> None:
         """A sign to the right of the road, for traffic that leaves at `contact`."""
@@ -526,7 +549,14 @@ class Map:
         self.sign(contact, back, lanes, "274", name=f"limit {limit}", value=str(limit), unit="km/h")
 
     def flat_object(
-        self, road: Road, s: float, t0: float, t1: float, depth: float, lanes: Sequence[int], **attributes: str
+        self,
+        road: Road,
+        s: float,
+        t0: float,
+        t1: float,
+        depth: float,
+        lanes: Sequence[int],
+        **attributes: str,
     ) -> None:
         """Paint a rectangle across the road: `depth` along it, from `t0` to `t1`."""
         half_u, half_v = depth / 2, abs(t1 - t0) / 2
@@ -547,10 +577,17 @@ class Map:
         numbers = contact.leaving(lanes)
         s = contact.s - back + 0.25 if contact.at == "end" else back - 0.25
         self.flat_object(
-            contact.road, s, contact.t(numbers[0]), contact.t(numbers[-1], 1.0), 0.5, numbers,
-            type="roadMark", subtype="signalLines", name="StopLine",
+            contact.road,
+            s,
+            contact.t(numbers[0]),
+            contact.t(numbers[-1], 1.0),
+            0.5,
+            numbers,
+            type="roadMark",
+            subtype="signalLines",
+            name="StopLine",
             orientation="+" if contact.at == "end" else "-",
-        )  # fmt: skip
+        )
 
     def crosswalk(self, contact: Contact, back: float) -> None:
         """A crosswalk 4 m wide over all driving lanes, whose far edge is `back` metres from the end."""
@@ -563,9 +600,16 @@ class Map:
         edges = [contact.t(n, across) for n in numbers for across in (0.0, 1.0)]
         s = contact.s - back - 2.0 if contact.at == "end" else back + 2.0
         self.flat_object(
-            contact.road, s, min(edges), max(edges), 4.0, numbers,
-            type="crosswalk", name="Crosswalk", orientation="none",
-        )  # fmt: skip
+            contact.road,
+            s,
+            min(edges),
+            max(edges),
+            4.0,
+            numbers,
+            type="crosswalk",
+            name="Crosswalk",
+            orientation="none",
+        )
 
     # --------------------------------------------------------------------------------------- file
 
@@ -579,7 +623,9 @@ class Map:
             for pose in (road.curve.pose(f * road.curve.length / 8) for f in range(9))
             for side in (-1, 1)
         ]
-        header = etree.SubElement(root, "header", revMajor="1", revMinor="7", name=self.name, version="1", date=DATE)
+        header = etree.SubElement(root, "header", revMajor="1", revMinor="7", name=self.name)
+        header.set("version", "1")
+        header.set("date", DATE)
         header.set("north", str(math.ceil(max(p.y for p in points))))
         header.set("south", str(math.floor(min(p.y for p in points))))
         header.set("east", str(math.ceil(max(p.x for p in points))))
@@ -589,15 +635,12 @@ class Map:
         for road in every:
             root.append(road_element(road))
         for number, (name, lights) in enumerate(self.controllers, 1):
-            element = etree.SubElement(root, "controller", id=str(number), name=name, sequence=str(number - 1))
+            element = etree.SubElement(root, "controller", id=str(number), name=name)
+            element.set("sequence", str(number - 1))
             for light in lights:
                 etree.SubElement(element, "control", signalId=str(light), type="0")
         for junction in self.junctions:
             root.append(junction_element(junction))
-        for number, (name, junctions) in enumerate(self.roundabouts, 1):
-            group = etree.SubElement(root, "junctionGroup", id=str(number), name=name, type="roundabout")
-            for junction in junctions:
-                etree.SubElement(group, "junctionReference", junction=str(junction.id))
         return etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True)
 
 
@@ -627,8 +670,8 @@ def road_element(road: Road) -> etree._Element:
         if isinstance(neighbour, Junction):
             etree.SubElement(link, tag, elementType="junction", elementId=str(neighbour.id))
         elif neighbour:
-            attributes = {"elementId": str(neighbour.road.id), "contactPoint": neighbour.at}
-            etree.SubElement(link, tag, elementType="road", **attributes)
+            other = etree.SubElement(link, tag, elementType="road", elementId=str(neighbour.road.id))
+            other.set("contactPoint", neighbour.at)
     kind = etree.SubElement(element, "type", s="0", type=road.kind, country="DE")
     etree.SubElement(kind, "speed", max=text(road.speed), unit="km/h")
     plan = etree.SubElement(element, "planView")
@@ -647,8 +690,9 @@ def road_element(road: Road) -> etree._Element:
         add_cubic(elevation, "elevation", "s", s, cubic)
     etree.SubElement(element, "lateralProfile")
     lanes = etree.SubElement(element, "lanes")
-    for s, cubic in road.offset.records(0.0, road.curve.length):
-        add_cubic(lanes, "laneOffset", "s", s, cubic)
+    if any(v for _, v in road.offset.knots):
+        for s, cubic in road.offset.records(0.0, road.curve.length):
+            add_cubic(lanes, "laneOffset", "s", s, cubic)
     for index in range(len(road.sections)):
         lanes.append(section_element(road, index))
     for tag, items in (("objects", road.objects), ("signals", road.signals)):
@@ -664,7 +708,8 @@ def section_element(road: Road, index: int) -> etree._Element:
     element = etree.Element("laneSection", s=text(section.s))
     for side, lanes, sign in (("left", section.left, 1), ("center", (), 0), ("right", section.right, -1)):
         if side == "center":
-            centre = etree.SubElement(etree.SubElement(element, side), "lane", id="0", type="none", level="false")
+            parent = etree.SubElement(element, side)
+            centre = etree.SubElement(parent, "lane", id="0", type="none", level="false")
             add_mark(centre, 0.0, section.centre)
         elif lanes:
             parent = etree.SubElement(element, side)
@@ -745,9 +790,9 @@ def junction_element(junction: Junction) -> etree._Element:
 
 # --------------------------------------------------------------------------------- urban building
 
-HALF_MEDIAN = 2.0  # half of the median of a main road
 POCKET = 3.25  # left-turn lane; it takes the place of the median but for a narrow island
 ISLAND = 0.75
+SHIFT = (POCKET - ISLAND) / 2  # from the middle of the median to the edge between the two
 STORAGE, TAPER = 70.0, 45.0  # length of turn lanes, and of their opening
 SOLID = 35.0  # before the stop line lanes must not be changed
 STOP_BACK = 6.0  # stop line to end of road; the crosswalk lies between them
@@ -782,8 +827,8 @@ def approach(
 ) -> Road:
     """A one-way carriageway towards an intersection, where a left-turn pocket opens in the median.
 
-    The reference line is the middle of the median, which is `far` wide (half) at the far end. With
-    `right_turn` (width) a right lane opens too.
+    The reference line is the left edge of the pocket. `far` is the width of the median to its right
+    at the far end. With `right_turn` (width) a right lane opens too.
     """
     length = curve.length
     s0, s1, s2 = 60.0, length - STORAGE - TAPER, length - STORAGE
@@ -791,27 +836,24 @@ def approach(
     left = Lane("left", Profile((s1, 0), (s2, POCKET)), mark=solid)
     through = [Lane("t1", 3.5, mark=solid), Lane("t2", 3.25)]
     right: list[Lane] = []
-    before = [Lane("median", Profile((0, far), (s0, HALF_MEDIAN)), "median"), *through, walk()]
+    before = [Lane("median", Profile((0, far or POCKET), (s0, POCKET)), "median"), *through, walk()]
     if right_turn:
         right = [Lane("right", Profile((s1, 0), (s2, right_turn)))]
         through[1] = through[1]._replace(mark=solid)
-    closing = Lane("median", Profile((s1, HALF_MEDIAN), (s2, 0)), "median")
+    closing = Lane("median", Profile((s1, POCKET), (s2, 0)), "median")
     sections = [
         Section(0, before, centre="none"),
         Section(s1, [closing, left, *through, *right, walk()], centre="none"),
         Section(s2, [left, *through, *right, walk()]),
     ]
-    offset = Profile((s1, 0), (s2, POCKET - HALF_MEDIAN))
-    return m.road(name, curve, sections, offset=offset, height=height)
+    return m.road(name, curve, sections, height=height)
 
 
 def departure(m: Map, name: str, curve: Curve, *, far: float, height: Profile | float) -> Road:
     """A one-way carriageway away from an intersection, beside the pocket of `approach`."""
-    s1, s2, s3 = STORAGE, STORAGE + TAPER, curve.length - 60.0
-    edges = [(s1, ISLAND), (s2, HALF_MEDIAN), (s3, HALF_MEDIAN), (curve.length, far)]
-    lanes = [Lane("median", Profile(*edges), "median"), Lane("out1", 3.5), Lane("out2", 3.25), walk()]
-    offset = Profile((s1, ISLAND - HALF_MEDIAN), (s2, 0.0))
-    return m.road(name, curve, [Section(0, lanes, centre="none")], offset=offset, height=height)
+    island = Profile((curve.length - 60.0, ISLAND), (curve.length, far or ISLAND))
+    lanes = [Lane("median", island, "median"), Lane("out1", 3.5), Lane("out2", 3.25), walk()]
+    return m.road(name, curve, [Section(0, lanes, centre="none")], height=height)
 
 
 def main_arm(
@@ -820,14 +862,12 @@ def main_arm(
     curve: Curve,
     *,
     right_turn: float = 0.0,
-    far: float = HALF_MEDIAN,
+    far: float = 0.0,
     height: Profile | float = 0.0,
 ) -> Arm:
     """A dual carriageway with two lanes each way that widens towards the intersection."""
     towards = approach(m, f"{name} in", curve, right_turn=right_turn, far=far, height=height)
-    away = departure(
-        m, f"{name} out", curve.reversed(), far=far, height=mirrored(height, curve.length)
-    )
+    away = departure(m, f"{name} out", curve.reversed(), far=far, height=mirrored(height, curve.length))
     return Arm(towards.end, away.start)
 
 
@@ -838,22 +878,20 @@ def street(
     lanes_in: Sequence[Lane],
     lanes_out: Sequence[Lane],
     *,
-    offset: float = 0.0,
     height: Profile | float = 0.0,
 ) -> Arm:
     """A two-way road towards an intersection."""
     solid = ((0.0, "broken"), (curve.length - SOLID, "solid"))
     marked = [lane._replace(mark=solid) for lane in lanes_in[:-1]]
     section = Section(0, [*marked, lanes_in[-1], walk()], [*lanes_out, walk()])
-    road = m.road(name, curve, [section], offset=offset, height=height)
+    road = m.road(name, curve, [section], height=height)
     return Arm(road.end, road.end)
 
 
 def minor_arm(m: Map, name: str, curve: Curve, height: Profile | float = 0.0) -> Arm:
-    """A two-way street, two lanes in and one out; the left lane straddles the axis, so that the
-    through lane is in line with the one that leaves on the other side."""
+    """A two-way street, two lanes in and one out."""
     lanes = [Lane("left", 3.0), Lane("t1", 3.25)]
-    return street(m, name, curve, lanes, [Lane("out1", 3.5)], offset=1.5, height=height)
+    return street(m, name, curve, lanes, [Lane("out1", 3.5)], height=height)
 
 
 Moves = Sequence[tuple[str, Sequence[str], str, Sequence[str]]]
@@ -919,9 +957,9 @@ def signalised(m: Map, name: str, arms: dict[str, Arm], height: float = 0.0) -> 
 
 RING = (Lane("inner", 4.25), Lane("outer", 4.75), walk(2.0))
 RING_RADIUS = 25.0  # edge of the central island
-RING_MOUTH = 38.0  # from the centre to the ends of the arms
-SPLITTER = 4.5  # half of the splitter island at the ring
-MOUTH_ANGLE = math.radians(33)  # a junction spans this much of the ring on both sides of its arm
+RING_MOUTH = 40.0  # from the centre to the ends of the arms
+SPLITTER = 4.0  # half of the splitter island at the ring
+MOUTH_ANGLE = math.radians(35)  # a junction spans this much of the ring on both sides of its arm
 
 
 def ring_arm(m: Map, name: str, curve: Curve, height: Profile | float = 0.0) -> Arm:
@@ -949,24 +987,25 @@ def roundabout(
     for i, (a, _) in enumerate(arms):
         b = arms[(i + 1) % len(arms)][0]
         curve = ring_arc(a + MOUTH_ANGLE, a + (b - a) % (2 * math.pi) - MOUTH_ANGLE)
-        segments.append(
-            m.road(f"{name} ring {i + 1}", curve, [Section(0, RING)], speed=30, height=height)
-        )
-    junctions = []
+        segments.append(m.road(f"{name} ring {i + 1}", curve, [Section(0, RING)], speed=30, height=height))
     for i, (angle, arm) in enumerate(arms):
         junction = m.junction(f"{name} arm {i + 1}", height)
-        junctions.append(junction)
         before, after = segments[i - 1].end, segments[i].start
         ring = junction.connect(
-            before, ["inner", "outer"], after, ["inner", "outer"],
-            curve=ring_arc(angle - MOUTH_ANGLE, angle + MOUTH_ANGLE), between="broken", outside="broken",
-        )  # fmt: skip
+            before,
+            ["inner", "outer"],
+            after,
+            ["inner", "outer"],
+            curve=ring_arc(angle - MOUTH_ANGLE, angle + MOUTH_ANGLE),
+            between="broken",
+            outside="broken",
+        )
         if arm.leave:
             left, right = arm.leave.keys(leaving=False)
             pavement = arm.leave.keys(leaving=False, kind="sidewalk")
             junction.connect(before, ["inner"], arm.leave, [left], speed=30)
             junction.connect(before, ["outer", *pavement], arm.leave, [right, *pavement], speed=30)
-            if arm.enter is None or arm.leave.road is not arm.enter.road:
+            if arm.enter and arm.leave.road is not arm.enter.road:
                 m.crosswalk(arm.leave, 7.0)
         if arm.enter:
             left, right = arm.enter.keys(leaving=True)
@@ -977,7 +1016,6 @@ def roundabout(
             junction.priorities += [(ring, road) for road in low]
             m.sign(arm.enter, 0.5, [left, right], "205", name="yield")
             m.crosswalk(arm.enter, 7.0)
-    m.roundabouts.append((name, junctions))
 
 
 # ------------------------------------------------------------------------------------- expressways
@@ -1023,9 +1061,7 @@ def expressway(
 
 def opposite(m: Map, name: str, base: Curve, height: Profile | float = 0.0) -> Road:
     """The carriageway of the other direction, across the central reserve."""
-    return expressway(
-        m, name, base.reversed(), offset=-RESERVE, height=mirrored(height, base.length)
-    )
+    return expressway(m, name, base.reversed(), offset=-RESERVE, height=mirrored(height, base.length))
 
 
 def to_ramp() -> float:
@@ -1045,20 +1081,32 @@ def merge(m: Map, name: str, before: Road, ramp: Road, after: Road, base: Curve,
     """The junction where a ramp becomes the acceleration lane."""
     junction = m.junction(name, height)
     main = junction.connect(
-        before.end, ["edge", *LANES, "hard"], after.start, ["edge", *LANES, None],
-        curve=base, between="broken", speed=120,
-    )  # fmt: skip
+        before.end,
+        ["edge", *LANES, "hard"],
+        after.start,
+        ["edge", *LANES, None],
+        curve=base,
+        between="broken",
+        speed=120,
+    )
     low = junction.connect(ramp.end, ["edge", "ramp", "hard"], after.start, [None, "merge", "hard"], speed=80)
     junction.priorities.append((main, low))
 
 
-def diverge(m: Map, name: str, before: Road, ramp: Road, after: Road, base: Curve, height: float = 0.0) -> None:
+def diverge(
+    m: Map, name: str, before: Road, ramp: Road, after: Road, base: Curve, height: float = 0.0
+) -> None:
     """The junction where the deceleration lane becomes a ramp."""
     junction = m.junction(name, height)
     junction.connect(
-        before.end, ["edge", *LANES, None], after.start, ["edge", *LANES, "hard"],
-        curve=base, between="broken", speed=120,
-    )  # fmt: skip
+        before.end,
+        ["edge", *LANES, None],
+        after.start,
+        ["edge", *LANES, "hard"],
+        curve=base,
+        between="broken",
+        speed=120,
+    )
     junction.connect(before.end, [None, "diverge", "hard"], ramp.start, ["edge", "ramp", "hard"], speed=80)
 
 
@@ -1076,9 +1124,10 @@ def highway() -> Map:
     half = round(base.length / 2, 6)
     driving = [Lane("l1", 3.5), Lane("l2", 3.5), Lane("l3", 3.6), Lane("l4", 3.75, speed=100)]
     lanes = [Lane("median", 1.5, "median"), EDGE, *driving, HARD]
+    sections = [Section(0, lanes, lanes, centre="none")]
     west, east = (
-        m.road(name, curve, [Section(0, lanes, lanes, centre="none")], kind="motorway", speed=120)
-        for name, curve in (("motorway west", base.cut(0, half)), ("motorway east", base.cut(half, base.length)))
+        m.road(f"motorway {name}", base.cut(a, b), sections, kind="motorway", speed=120)
+        for name, a, b in (("west", 0, half), ("east", half, base.length))
     )
     m.link(west.end, east.start)
     for contact in (west.end, east.start):
@@ -1123,10 +1172,10 @@ def intersection() -> Map:
     m = Map("intersection")
     bent = [Piece(35), *arc(160, -30, 40), Piece(80)]
     arms = {
-        "W": main_arm(m, "west", inwards(Pose(-18, 0, 0), [Piece(200)]), right_turn=3.0),
-        "E": main_arm(m, "east", inwards(Pose(18, 0, math.pi), [Piece(200)])),
-        "N": minor_arm(m, "north", inwards(Pose(0, 23, -math.pi / 2), [Piece(200)])),
-        "S": minor_arm(m, "south", inwards(Pose(-1.5, -26, math.radians(84)), bent)),
+        "W": main_arm(m, "west", inwards(Pose(-18, SHIFT, 0), [Piece(200)]), right_turn=3.0),
+        "E": main_arm(m, "east", inwards(Pose(18, -SHIFT, math.pi), [Piece(200)])),
+        "N": minor_arm(m, "north", inwards(Pose(1.5, 23, -math.pi / 2), [Piece(200)])),
+        "S": minor_arm(m, "south", inwards(Pose(-3.0, -26, math.radians(84)), bent)),
     }
     signalised(m, "crossing", arms)
     return m
@@ -1158,15 +1207,15 @@ def long_route() -> Map:
     # 1. a signalised intersection; the route starts on its west arm and leaves on the avenue
     start = [Piece(140), *arc(250, 15, 50), Piece(60)]
     avenue = [Piece(190), *arc(180, -34, 60), Piece(60), *arc(160, 22, 50), Piece(70)]
-    avenue = inwards(Pose(18, 0, math.pi), avenue)
+    avenue = inwards(Pose(18, -SHIFT, math.pi), avenue)
     south = [Piece(50), *arc(150, 20, 30), Piece(50)]
     z_ring = 3.0
     slope = Profile((70, z_ring), (avenue.length - 70, 0))
     arms = {
-        "W": main_arm(m, "start", inwards(Pose(-18, 0, 0), start)),
+        "W": main_arm(m, "start", inwards(Pose(-18, SHIFT, 0), start)),
         "E": main_arm(m, "avenue", avenue, far=SPLITTER, height=slope),
-        "N": minor_arm(m, "first north", inwards(Pose(0, 23, -math.pi / 2), [Piece(150)])),
-        "S": minor_arm(m, "first south", inwards(Pose(0, -23, math.pi / 2), south)),
+        "N": minor_arm(m, "first north", inwards(Pose(1.5, 23, -math.pi / 2), [Piece(150)])),
+        "S": minor_arm(m, "first south", inwards(Pose(-1.5, -23, math.pi / 2), south)),
     }
     signalised(m, "first crossing", arms)
 
@@ -1174,11 +1223,11 @@ def long_route() -> Map:
     towards, away = arms["E"].leave, arms["E"].enter
     assert towards and away
     centre = avenue.start.move(ahead=-RING_MOUTH)
-    mouths = [centre.move(turn=math.radians(d)).move(ahead=RING_MOUTH) for d in (0, 92, 178, 272)]
-    ring_south = ring_arm(
-        m, "ring south", inwards(mouths[1].move(turn=math.pi), [Piece(80), *arc(200, 12, 20), Piece(30)]), z_ring
-    )
-    ring_north = ring_arm(m, "ring north", inwards(mouths[3].move(turn=math.pi), [Piece(150)]), z_ring)
+    mouths = [centre.move(turn=math.radians(d)).move(ahead=RING_MOUTH) for d in (0, 92, 180, 272)]
+    south = inwards(mouths[1].move(turn=math.pi), [Piece(80), *arc(200, 12, 20), Piece(30)])
+    north = inwards(mouths[3].move(turn=math.pi), [Piece(150)])
+    ring_south = ring_arm(m, "ring south", south, z_ring)
+    ring_north = ring_arm(m, "ring north", north, z_ring)
     z_road = 8.0
     shape = [Piece(150), *arc(150, 38, 60), Piece(60), *arc(220, -48, 70), Piece(60)]
     up = Curve(mouths[2].move(left=-SPLITTER), shape)
@@ -1230,7 +1279,7 @@ def long_route() -> Map:
     shape = [Piece(80), *arc(160, -64, 60), Piece(60), *arc(140, 30, 50), Piece(130)]
     down = Curve(base.pose(off + NOSE).move(left=-to_ramp(), turn=-GORE_ANGLE), shape)
     s1, s2 = down.length - 100, down.length - 60
-    slow = at_speed(RAMP, 50)
+    slow = [*at_speed(RAMP[:2], 50), walk(2.0)]
     solid = ((0.0, "broken"), (down.length - SOLID, "solid"))
     opening = [
         slow[0],
@@ -1257,23 +1306,20 @@ def long_route() -> Map:
         name: middle_of_crossing.move(turn=math.radians(turn)).move(ahead=ahead, left=left, turn=math.pi)
         for name, turn, ahead, left in (("left", 90, 16, 0), ("right", -90, 21, 0), ("across", 0, 17, -0.75))
     }
-    one_in, one_out = [Lane("t1", 3.5)], [Lane("out1", 3.5)]
-    last_arms = {
-        "ramp": Arm(off_ramp.end, None),
-        "left": street(
-            m, "finish", inwards(ends["left"], [Piece(120), *arc(220, -16, 40), Piece(90)]), one_in, one_out, height=z_end
-        ),
-        "right": street(m, "last right", inwards(ends["right"], [Piece(150)]), one_in, one_out, height=z_end),
-        "across": street(
-            m, "last across", inwards(ends["across"], [Piece(60), *arc(140, 14, 20), Piece(60)]),
-            [Lane("t1", 3.25)], [Lane("out1", 3.25)], height=z_end,
-        ),
-    }  # fmt: skip
+    shapes = {
+        "left": ("finish", [Piece(120), *arc(220, -16, 40), Piece(90)], 3.5),
+        "right": ("last right", [Piece(150)], 3.5),
+        "across": ("last across", [Piece(60), *arc(140, 14, 20), Piece(60)], 3.25),
+    }
+    last_arms = {"ramp": Arm(off_ramp.end, None)}
+    for key, (name, shape, width) in shapes.items():
+        curve = inwards(ends[key], shape)
+        last_arms[key] = street(m, name, curve, [Lane("t1", width)], [Lane("out1", width)], height=z_end)
     crossing = m.junction("last crossing", z_end)
     moves: Moves = [
         ("ramp", ["ramp"], "left", ["out1"]),
         ("ramp", ["ramp"], "across", ["out1"]),
-        ("ramp", ["right"], "right", ["out1"]),
+        ("ramp", ["right", "walk"], "right", ["out1", "walk"]),
         ("left", ["t1"], "right", ["out1"]),
         ("left", ["t1"], "across", ["out1"]),
         ("right", ["t1"], "left", ["out1"]),
@@ -1284,11 +1330,12 @@ def long_route() -> Map:
     made = connect_all(crossing, last_arms, moves)
     minor = [*made["ramp"], *made["across"]]
     crossing.priorities += [(high, low) for high in [*made["left"], *made["right"]] for low in minor]
-    for name, sign in (("ramp", "206"), ("across", "206"), ("left", "306"), ("right", "306")):
-        enter = last_arms[name].enter
+    stop, priority = ("206", "stop"), ("306", "priority road")
+    for key, (sign, name) in {"ramp": stop, "across": stop, "left": priority, "right": priority}.items():
+        enter = last_arms[key].enter
         assert enter
-        furnish(m, last_arms[name], stop=sign == "206")
-        m.sign(enter, STOP_BACK, enter.keys(leaving=True), sign, name={"206": "stop", "306": "priority road"}[sign])
+        furnish(m, last_arms[key], stop=sign == "206")
+        m.sign(enter, STOP_BACK, enter.keys(leaving=True), sign, name=name)
     return m
 
 
