@@ -1172,7 +1172,7 @@ def intersection() -> Map:
     m = Map("intersection")
     bent = [Piece(35), *arc(160, -30, 40), Piece(80)]
     arms = {
-        "W": main_arm(m, "west", inwards(Pose(-18, SHIFT, 0), [Piece(200)]), right_turn=3.0),
+        "W": main_arm(m, "west", inwards(Pose(-18, SHIFT, 0), [Piece(200)]), right_turn=POCKET),
         "E": main_arm(m, "east", inwards(Pose(18, -SHIFT, math.pi), [Piece(200)])),
         "N": minor_arm(m, "north", inwards(Pose(1.5, 23, -math.pi / 2), [Piece(200)])),
         "S": minor_arm(m, "south", inwards(Pose(-3.0, -26, math.radians(84)), bent)),
