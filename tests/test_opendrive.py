@@ -797,3 +797,61 @@ def test_real_maps_load_and_every_seam_is_in_the_report(path):
     if path.stem.startswith("carla_town"):  # towns are continuous but for a handful of links
         links = sum(len(lane.successors) for lane in network.drivable_lanes())
         assert len(list(seams(network))) <= 0.02 * links
+
+
+def test_bend_of_the_road_itself_is_no_turn(read):
+    """A motorway that bends left inside a junction, and an exit that leaves it to the right."""
+    radius, length = 200.0, 150.0
+    bend, exit_ = length / radius, length / -400.0
+
+    def end(k, s):
+        return math.sin(k * s) / k, (1 - math.cos(k * s)) / k
+
+    def after(name, k):
+        x, y = end(k, length)
+        return road(name, [section(0, [], [lane(-1)])], x=x, y=y, hdg=k * length)
+
+    def way(name, k, to):
+        links = link("predecessor", "1", "end") + link("successor", to, "start")
+        return road(
+            name,
+            [section(0, [], [lane(-1, links=two_way(-1))])],
+            length=length,
+            shape=f'<arc curvature="{k}"/>',
+            junction=9,
+            links=links,
+        )
+
+    connections = "".join(
+        f'<connection id="{r}" incomingRoad="1" connectingRoad="{r}" contactPoint="start">'
+        '<laneLink from="-1" to="-1"/></connection>'
+        for r in (10, 11)
+    )
+    network = read(
+        road("1", [section(0, [], [lane(-1)])], x=-100.0, links=link("successor", "9", element="junction")),
+        after("2", 1 / radius),
+        after("3", -1 / 400),
+        way("10", 1 / radius, "2"),
+        way("11", -1 / 400, "3"),
+        f'<junction id="9">{connections}</junction>',
+    )
+    assert bend > math.radians(40) and abs(exit_) > math.radians(20)
+    turns = {m.outgoing: m.turn for m in network.movements}
+    # the exit bends less, so it is the way straight on, and the motorway turns from it by 64 degrees
+    assert turns["3_0_-1"] is Turn.STRAIGHT and turns["2_0_-1"] is Turn.LEFT
+    only = read(
+        road("1", [section(0, [], [lane(-1)])], x=-100.0, links=link("successor", "9", element="junction")),
+        after("2", 1 / radius),
+        way("10", 1 / radius, "2"),
+        f'<junction id="9">{connections.split("</connection>")[0]}</connection></junction>',
+    )
+    assert [m.turn for m in only.movements] == [Turn.STRAIGHT]
+
+
+def test_samples_keep_their_distance(read):
+    """Records a hair apart must not leave samples between which headings are noise."""
+    widths = "".join(f'<width sOffset="{s}" a="3.5"/>' for s in (0, 30, 30.0000000001, 30.0005, 60))
+    network = read(road("1", [section(0, [], [lane(-1, inner=widths)])]))
+    found = network.lane_at("1", -1, 0)
+    assert np.diff(found.s).min() > 4e-4
+    assert found.length == pytest.approx(100.0, abs=1e-12)

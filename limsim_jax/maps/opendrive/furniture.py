@@ -185,7 +185,7 @@ class Furnisher:
                     id=signal.id,
                     name=signal.name,
                     position=position,
-                    heading=float(facing),
+                    heading=self._heading(spots, float(facing)),
                     spots=tuple(spots),
                     turns=ARROWS.get((signal.type, signal.subtype), ()),
                     controller=self.controller_of.get(signal.id),
@@ -222,6 +222,16 @@ class Furnisher:
         )
         if kind is not SignKind.OTHER:
             self.report.read(f"{kind} sign")
+
+    def _heading(self, spots: list[LaneSpot], facing: float) -> float:
+        """Direction of the traffic that looks at a light: that of its lanes, else as the signal is turned.
+
+        Writers disagree on whether `orientation` means the traffic or the face of the light.
+        """
+        if not spots:
+            return facing
+        headings = np.array([self.lanes[spot.lane].pose(spot.s)[1] for spot in spots])
+        return float(np.angle(np.exp(1j * headings).sum()))
 
     def _spots(self, road: RawRoad, signal: RawSignal) -> list[LaneSpot]:
         """Lanes that the file names: by `validity`, else by the direction that `orientation` gives."""

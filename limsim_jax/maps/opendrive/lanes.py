@@ -21,6 +21,7 @@ from limsim_jax.maps.opendrive.records import Mark, RawLane, RawRoad, RawSection
 MIN_SECTION = 1e-3  # m; a lane section shorter than this holds no traffic
 MIN_WIDTH = 0.05  # m; a lane that nowhere gets wider does not exist for its neighbours
 JUMP = 0.01  # m; where lane edges jump by more, the lane is cut
+_SHORTEST = 2e-3  # m; records that hold for less are rounding errors of the writer
 _HERMITE = 1e-5  # m, tolerated error of cubic Hermite interpolation between samples
 _LINEAR = 5e-4  # m, tolerated error of linear interpolation of widths between samples
 _BRIDGE = 120.0  # a jump is smoothed over this multiple of it: headings are off by 1.5 / 120 rad
@@ -149,7 +150,8 @@ class RoadShape:
             cubics += [(section.s, lane.width), (section.s, lane.border)]
         found = [self.road.reference.s] + [s0 + c.s for s0, c in cubics if c is not None]
         knots = np.unique(np.concatenate(found))
-        return knots[(knots > start + 1e-6) & (knots < end - 1e-6)]
+        knots = knots[(knots > start + _SHORTEST) & (knots < end - _SHORTEST)]
+        return knots[np.diff(knots, append=np.inf) > _SHORTEST]  # of records that close the last counts
 
 
 def _width(lane: RawLane, side: int, inner: Array, s: Array, at: Array) -> Array:

@@ -14,12 +14,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from limsim_jax.maps.network import Control, ImportReport, Junction, Lane, Movement, Turn
+from limsim_jax.maps.network import (
+    DRIVABLE,
+    Control,
+    ImportReport,
+    Junction,
+    Lane,
+    LaneType,
+    Movement,
+    Turn,
+)
 from limsim_jax.maps.opendrive.lanes import MIN_SECTION, MIN_WIDTH, LaneKey, Piece, lane_id
 from limsim_jax.maps.opendrive.records import RawConnection, RawJunction, RawRoad, RoadLink
 
 # an end of a lane record of the file: road, section index, lane number, "start" or "end" in road s
 End = tuple[str, int, int, str]
+
+BEND = 40.0  # m; traffic that turns at a junction drives tighter than this
 
 
 @dataclass(frozen=True)
@@ -347,9 +358,14 @@ class Linker:
                     along: dict[str, str | None] = {}
                     against: dict[str, str | None] = {}
                     for side, n in beside.items():
-                        name = None if n is None else lane_id((road_id, piece.index, n))
-                        same = n is not None and piece.attributes[n].forward == own.forward
-                        along[side], against[side] = (name, None) if same else (None, name)
+                        along[side] = against[side] = None
+                        if n is None:
+                            continue
+                        other, name = piece.attributes[n], lane_id((road_id, piece.index, n))
+                        if other.forward == own.forward:
+                            along[side] = name
+                        elif other.type in DRIVABLE or other.type is LaneType.BIDIRECTIONAL:
+                            against[side] = name
                     left, right = ("up", "down") if own.forward else ("down", "up")
                     may = {"up": own.change_up, "down": own.change_down}
                     key = lane_id((road_id, piece.index, number))
@@ -383,7 +399,6 @@ def build_movements(
                 incoming=incoming,
                 outgoing=outgoing,
                 via=via,
-                turn=turn_of([lanes[v] for v in via]),
             )
         )
 
@@ -444,19 +459,40 @@ def build_movements(
             connectors=tuple(inside.get(name, ())),
             center=(float(center[0]), float(center[1])),
         )
-    return with_priorities(tuple(found), lanes, junctions, report), records
+    turned = with_turns(tuple(found), lanes)
+    return with_priorities(turned, lanes, junctions, report), records
 
 
-def turn_of(via: list[Lane]) -> Turn:
-    """Turn of a movement by the change of heading along its connectors."""
-    angle = np.degrees(sum(float(lane.heading[-1] - lane.heading[0]) for lane in via))
-    if abs(angle) > 150:
+def with_turns(movements: tuple[Movement, ...], lanes: dict[str, Lane]) -> tuple[Movement, ...]:
+    """Turn of every movement: its change of heading, measured from the way that the road itself goes.
+
+    A motorway that bends inside a junction is no left turn: where the straightest movement of an
+    incoming road follows a bend of more than `BEND` radius, its change of heading counts as straight.
+    """
+    angle = {
+        m.index: sum(float(lanes[v].heading[-1] - lanes[v].heading[0]) for v in m.via) for m in movements
+    }
+    length = {m.index: sum(lanes[v].length for v in m.via) for m in movements}
+    by_road: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for m in movements:
+        by_road[m.junction, lanes[m.incoming].road].append(m.index)
+    straight: dict[int, float] = {}
+    for members in by_road.values():
+        best = min(members, key=lambda m: abs(angle[m]))
+        bends = abs(angle[best]) > 0 and length[best] / abs(angle[best]) > BEND
+        straight.update({m: angle[best] if bends else 0.0 for m in members})
+    return tuple(replace(m, turn=_turn(angle[m.index] - straight[m.index])) for m in movements)
+
+
+def _turn(angle: float) -> Turn:
+    degrees = np.degrees(angle)
+    if abs(degrees) > 150:
         return Turn.U_TURN
-    if abs(angle) < 20:
+    if abs(degrees) < 20:
         return Turn.STRAIGHT
-    if abs(angle) < 45:
-        return Turn.SLIGHT_LEFT if angle > 0 else Turn.SLIGHT_RIGHT
-    return Turn.LEFT if angle > 0 else Turn.RIGHT
+    if abs(degrees) < 45:
+        return Turn.SLIGHT_LEFT if degrees > 0 else Turn.SLIGHT_RIGHT
+    return Turn.LEFT if degrees > 0 else Turn.RIGHT
 
 
 def with_priorities(
