@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("matplotlib")
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex, to_rgba
 from matplotlib.figure import Figure
@@ -171,7 +172,7 @@ def crossing() -> Network:
             Crosswalk(
                 id="z",
                 outline=np.array([[14.0, -6.0], [18.0, -6.0], [18.0, 7.0], [14.0, 7.0]]),
-                spans=(("E_in1", 42.0, 46.0),),
+                spans=(("E_right", 0.0, 12.0), ("E_in1", 42.0, 46.0), ("E_in2", 42.0, 46.0)),
             ),
         ),
     )
@@ -183,6 +184,15 @@ def _axes():
 
 def _polygons(artists) -> list[np.ndarray]:
     return [path.vertices[:-1] for artist in artists for path in artist.get_paths()]
+
+
+def _lines(artists) -> list[tuple[str, list[np.ndarray]]]:
+    """Colour and polylines of every line collection."""
+    return [
+        (to_hex(np.asarray(a.get_colors())[0]), [np.asarray(s) for s in a.get_segments()])
+        for a in artists
+        if isinstance(a, LineCollection)
+    ]
 
 
 def _area(polygon: np.ndarray) -> float:
@@ -231,12 +241,11 @@ def test_arrows_point_along_the_lane_they_stand_on(crossing):
 def test_marks_between_lanes_follow_the_permissions(crossing, arm, painted):
     ax = _axes()
     layers = draw_network(ax, crossing, bounds=(-20, -20, 20, 20))
-    white = [a for a in layers["marks"] if np.allclose(a.get_colors()[0][:3], 1.0)]
     along = {"E": np.array([1.0, 0.0]), "N": np.array([0.0, 1.0]), "W": np.array([-1.0, 0.0])}[arm]
     side = np.array([-along[1], along[0]])
     length: dict[float, float] = {}
-    for artist in white:
-        for p, q in (pair for line in artist.get_segments() for pair in itertools.pairwise(line)):
+    for line in (line for color, lines in _lines(layers["marks"]) if color == "#ffffff" for line in lines):
+        for p, q in itertools.pairwise(line):
             if p @ along > BOX - 1e-6 and q @ along > BOX - 1e-6 and abs((q - p) @ side) < 1e-9:
                 offset = round(float(p @ side), 2)
                 length[offset] = length.get(offset, 0.0) + abs(float((q - p) @ along))
@@ -247,26 +256,23 @@ def test_marks_between_lanes_follow_the_permissions(crossing, arm, painted):
 
 def test_opposite_directions_are_parted_by_one_centre_line(crossing):
     marks = draw_network(_axes(), crossing)["marks"]
-    centre = [a for a in marks if np.allclose(a.get_colors()[0], to_rgba(draw.CENTRE))]
-    assert sum(len(a.get_segments()) for a in centre) == 4
+    assert sum(len(lines) for color, lines in _lines(marks) if color == draw.CENTRE) == 4
 
 
 def test_connectors_have_the_colour_of_their_turn(crossing):
     artists = draw_network(_axes(), crossing)["connectors"]
-    lines = [a for a in artists if isinstance(a, LineCollection)]
-    counts = {to_hex(a.get_colors()[0]): len(a.get_segments()) for a in lines}
+    counts = {color: len(lines) for color, lines in _lines(artists)}
     assert counts == {"#0072b2": 4, "#d55e00": 4, "#007a57": 4}
 
 
 def test_a_connector_that_no_movement_uses_stands_out(crossing):
     artists = draw_network(_axes(), replace(crossing, movements=crossing.movements[1:]))["connectors"]
-    black = [a for a in artists if isinstance(a, LineCollection) and to_hex(a.get_colors()[0]) == "#000000"]
-    assert [len(a.get_segments()) for a in black] == [1]
+    assert [len(lines) for color, lines in _lines(artists) if color == "#000000"] == [1]
 
 
 def test_stop_bars_lie_across_their_lanes(crossing):
     layers = draw_network(_axes(), crossing)
-    bars = [bar for artist in layers["stop_lines"] for bar in artist.get_segments()]
+    bars = [bar for _, lines in _lines(layers["stop_lines"]) for bar in lines]
     line = next(bar for bar in bars if np.allclose(bar.mean(0), [-13.0, -1.75]))
     np.testing.assert_allclose(sorted(line[:, 1]), [-3.5, 0.0], atol=1e-9)
     # Lanes with signals but neither head nor line in the file are barred at their end: 8 - 2 - 1.
@@ -276,7 +282,7 @@ def test_stop_bars_lie_across_their_lanes(crossing):
 
 def test_a_light_is_linked_to_every_lane_it_governs(crossing):
     lights = draw_network(_axes(), crossing)["lights"]
-    starts = [seg for a in lights if isinstance(a, LineCollection) for seg in a.get_segments()]
+    starts = [line for _, lines in _lines(lights) for line in lines]
     links = [seg for seg in starts if np.allclose(seg[0], [14.0, 9.0]) and np.hypot(*(seg[1] - seg[0])) > 3]
     np.testing.assert_allclose(sorted(seg[1][1] for seg in links), [1.75, 5.25], atol=1e-9)
     tick = next(seg for seg in starts if np.allclose(seg[0], [14.0, 9.0]) and abs(seg[1][1] - 9.0) < 1e-9)
@@ -318,9 +324,21 @@ def test_a_bridge_hides_the_road_below(crossing):
     below = _line("low_1", (-50.0, 0.0), (50.0, 0.0))
     above = _line("high_1", (0.0, -50.0), (0.0, 50.0))
     above = replace(above, xyz=above.xyz + np.array([0.0, 0.0, 6.0]))
-    network = replace(
+    network = _only(crossing, above, below)
+    layers = draw_network(_axes(), network)
+    top = max(layers["surfaces"], key=lambda a: a.get_zorder())
+    low, high = _polygons([top])[0].min(0), _polygons([top])[0].max(0)
+    assert high[1] - low[1] > 99
+    lower_marks = [a for a in layers["marks"] if any(np.ptp(s[:, 0]) > 99 for s in _lines([a])[0][1])]
+    assert lower_marks
+    assert all(a.get_zorder() < top.get_zorder() for a in lower_marks)
+
+
+def _only(crossing: Network, *lanes: Lane) -> Network:
+    """A network of these lanes and nothing else."""
+    return replace(
         crossing,
-        lanes={"high_1": above, "low_1": below},
+        lanes={lane.id: lane for lane in lanes},
         roads={},
         movements=(),
         junctions={},
@@ -329,45 +347,55 @@ def test_a_bridge_hides_the_road_below(crossing):
         stop_lines=(),
         crosswalks=(),
     )
-    layers = draw_network(_axes(), network)
-    top = max(layers["surfaces"], key=lambda a: a.get_zorder())
-    low, high = _polygons([top])[0].min(0), _polygons([top])[0].max(0)
-    assert high[1] - low[1] > 99
-    lower_marks = [a for a in layers["marks"] if any(np.ptp(s[:, 0]) > 99 for s in a.get_segments())]
-    assert lower_marks
-    assert all(a.get_zorder() < top.get_zorder() for a in lower_marks)
 
 
-def test_a_long_thin_map_is_cut_into_strips_of_one_scale(crossing):
-    lane = _line("road_1", (0.0, 0.0), (10_000.0, 0.0))
-    network = replace(
-        crossing, lanes={"road_1": lane}, roads={}, movements=(), junctions={}, traffic_lights=(), signs=()
-    )
-    network = replace(network, stop_lines=(), crosswalks=())
-    figure = draw_map(network)
-    assert len(figure.axes) > 3
-    scales = []
-    for ax in figure.axes:
-        (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
-        box = ax.get_window_extent()
-        assert box.width / (x1 - x0) == pytest.approx(box.height / (y1 - y0), rel=1e-6)
-        scales.append(box.width / (x1 - x0))
-    np.testing.assert_allclose(scales, scales[0])
-    # Every strip begins where the one above it ended.
-    for ax, following in itertools.pairwise(figure.axes):
-        assert following.get_xlim()[0] == pytest.approx(ax.get_xlim()[1])
-    assert figure.axes[0].get_xlim()[0] <= 0.0
-    assert figure.axes[-1].get_xlim()[1] >= 10_000.0
-    assert 3.5 * scales[0] > 3.0  # px: a lane can be seen
+def _scale(ax: Axes) -> tuple[float, float]:
+    (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
+    box = ax.get_window_extent()
+    return box.width / (x1 - x0), box.height / (y1 - y0)
+
+
+@pytest.mark.parametrize(("heading", "gain"), [(0.0, 5), (0.4, 1.5), (math.pi / 2, 5)])
+def test_a_long_thin_map_is_cut_into_strips_of_one_scale(crossing, heading, gain):
+    end = (10_000.0 * math.cos(heading), 10_000.0 * math.sin(heading))
+    figure = draw_map(_only(crossing, _line("road_1", (0.0, 0.0), end)))
+    strips = [ax for ax in figure.axes if not ax.get_title(loc="left")]
+    assert len(strips) > 1
+    scales = [_scale(ax) for ax in strips]
+    np.testing.assert_allclose(scales, scales[0][0])
+    # Every strip begins where the one before ended, and shows the road there.
+    axis = 1 if heading > 1 else 0
+    spans = [(ax.get_xlim(), ax.get_ylim()) for ax in strips]
+    for before, after in itertools.pairwise(spans):
+        assert after[axis][0] == pytest.approx(before[axis][1])
+    assert spans[0][axis][0] <= 0.0
+    assert spans[-1][axis][1] >= end[axis]
+    for span in spans:
+        along = 0.5 * (span[axis][0] + span[axis][1])
+        beside = along / end[axis] * end[1 - axis]
+        assert span[1 - axis][0] < beside < span[1 - axis][1]
+    whole = figure.get_size_inches()[axis] * figure.dpi / end[axis]
+    assert scales[0][0] > gain * whole  # what strips are for
+
+
+def test_details_show_junctions_that_are_small_on_the_page(crossing):
+    far = _line("far_1", (2000.0, 1500.0), (0.0, 1500.0))
+    figure = draw_map(replace(crossing, lanes={**crossing.lanes, "far_1": far}))
+    (overview,) = (ax for ax in figure.axes if not ax.get_title(loc="left"))
+    details = {ax.get_title(loc="left"): ax for ax in figure.axes if ax is not overview}
+    assert _scale(details["A"])[0] > 3 * _scale(overview)[0]
+    for reach in (-BOX, BOX):  # the whole junction
+        assert details["A"].get_xlim()[0] < reach < details["A"].get_xlim()[1]
+        assert details["A"].get_ylim()[0] < reach < details["A"].get_ylim()[1]
+    assert set(details) <= {text.get_text() for text in overview.texts}  # each is framed on the map
+    assert all(_scale(ax)[0] == pytest.approx(_scale(ax)[1], rel=1e-6) for ax in figure.axes)
 
 
 @pytest.mark.parametrize("size", [None, (6.0, 9.0), (12.0, 4.0)])
 def test_axes_have_one_scale_for_x_and_y(crossing, size):
     figure = draw_map(crossing, size=size)
     (ax,) = figure.axes
-    (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
-    box = ax.get_window_extent()
-    assert box.width / (x1 - x0) == pytest.approx(box.height / (y1 - y0), rel=1e-6)
+    assert _scale(ax)[0] == pytest.approx(_scale(ax)[1], rel=1e-6)
     if size:
         assert tuple(figure.get_size_inches()) == size
 
@@ -408,7 +436,7 @@ def test_svg_is_xml_with_a_path_per_lane_and_the_same_every_time(crossing, tmp_p
     draw_map(crossing, tmp_path / "b.svg")
     root = ET.parse(tmp_path / "a.svg").getroot()
     assert root.tag == "{http://www.w3.org/2000/svg}svg"
-    (group,) = [g for g in root.iter() if g.get("id") == "surfaces-0"]
+    (group,) = [g for g in root.iter() if g.get("id") == "map0-surfaces-0"]
     drawn = [e for e in group.iter() if e.tag.endswith(("}use", "}path"))]
     clip_or_use = [e for e in drawn if e.tag.endswith("}use")] or drawn
     assert len(clip_or_use) == len(crossing.lanes)

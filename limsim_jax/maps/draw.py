@@ -12,13 +12,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence, Sized
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from limsim_jax.maps.network import (
+    DRIVABLE,
     Action,
     Array,
     Control,
@@ -76,6 +77,7 @@ _KINDS: dict[str, tuple[str, tuple[LaneType, ...]]] = {
     ),
 }
 _KIND_OF = {type_: kind for kind, (_, types) in _KINDS.items() for type_ in types}
+_TRAFFIC = DRIVABLE | {LaneType.BIDIRECTIONAL}
 _TURNS: dict[str, tuple[str, tuple[Turn, ...]]] = {
     "straight": ("#0072b2", (Turn.STRAIGHT,)),
     "left": ("#d55e00", (Turn.LEFT, Turn.SLIGHT_LEFT)),
@@ -115,6 +117,10 @@ class _Shape:
         """Points `[..., 2]` of a border or the centre at arc length `s` (m, clipped)."""
         return np.stack([np.interp(s, self.s, border[:, 0]), np.interp(s, self.s, border[:, 1])], -1)
 
+    def heading_at(self, s: float) -> float:
+        """Direction of travel (rad) at arc length `s` (m, clipped)."""
+        return float(np.interp(s, self.s, self.heading))
+
     def stretch(self, s_in: float, s_out: float) -> Array:
         """Outline `[K, 2]` of the surface between two arc lengths (m)."""
         inside = self.s[(self.s > s_in) & (self.s < s_out)]
@@ -128,7 +134,8 @@ def _shape(lane: Lane) -> _Shape:
     start = np.repeat(np.arange(len(pieces)), pieces)
     step = np.arange(len(start)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     s = np.append(lane.s[start] + step / pieces[start] * np.diff(lane.s)[start], lane.s[-1])
-    xyz, heading = lane.pose(s)
+    xyz, _ = lane.pose(s)
+    heading = np.interp(s, lane.s, lane.heading)  # the slope of the cubic is noise between twin samples
     normal = np.stack([-np.sin(heading), np.cos(heading)], -1)
     half = 0.5 * np.maximum(lane.width_at(s), 0.0)[:, None] * normal
     centre = xyz[:, :2]
@@ -137,7 +144,7 @@ def _shape(lane: Lane) -> _Shape:
 
 
 def _kind(lane: Lane) -> str:
-    if lane.type is LaneType.DRIVING and not lane.access:
+    if lane.type in DRIVABLE and not lane.drivable:
         return "closed or other lane"
     return _KIND_OF[lane.type]
 
@@ -194,23 +201,50 @@ def _placed(outline: Array, xy: Array, heading: Array) -> Array:
     return xy[:, None, :] + np.stack([cos * x - sin * y, sin * x + cos * y], -1)
 
 
-@dataclass
 class _Painter:
-    """Draws one network on one pair of axes. `ppm` is the scale in points per metre."""
+    """Draws one network on one pair of axes, which it sets to show `bounds` with equal aspect."""
 
-    ax: Axes
-    network: Network
-    shapes: dict[str, _Shape]  # the visible lanes
-    levels: dict[str, int]
-    ppm: float
-    bounds: Bounds
-    layers: dict[str, list[Artist]] = field(default_factory=dict)
-    legend: dict[str, dict[str, Any]] = field(default_factory=dict)  # label -> style of its sample
+    def __init__(
+        self,
+        ax: Axes,
+        network: Network,
+        shapes: dict[str, _Shape],
+        levels: dict[str, int],
+        bounds: Bounds,
+        name: str = "",
+    ) -> None:
+        ax.set_aspect("equal", adjustable="box")
+        ax.set_xlim(bounds[0], bounds[2])
+        ax.set_ylim(bounds[1], bounds[3])
+        extent = ax.get_window_extent()
+        pixels = min(extent.width / (bounds[2] - bounds[0]), extent.height / (bounds[3] - bounds[1]))
+        figure = ax.get_figure(root=True)
+        assert figure is not None
+        self.ax, self.network, self.bounds, self.name = ax, network, bounds, name
+        self.shapes = {id_: shape for id_, shape in shapes.items() if shape.meets(bounds)}
+        self.levels = levels
+        self.ppm = pixels * _POINT / figure.dpi  # scale in points per metre
+        self.layers: dict[str, list[Artist]] = {}
+        self.legend: dict[str, dict[str, Any]] = {}  # label -> style of its sample
+
+    def paint(self, *, conflicts: bool, labels: bool) -> None:
+        self.surfaces()
+        self.marks()
+        self.arrows()
+        self.connectors(faint=conflicts)
+        if conflicts:
+            self.conflicts()
+        self.crosswalks()
+        self.stops()
+        self.lights()
+        self.signs()
+        if labels:
+            self.labels()
 
     def keep(self, layer: str, artist: Any, zorder: float) -> Any:
         """Register an artist under a layer; its `gid` names it in SVG files."""
         artist.set_zorder(zorder)
-        artist.set_gid(f"{layer}-{len(self.layers.setdefault(layer, []))}")
+        artist.set_gid(f"{self.name}{layer}-{len(self.layers.setdefault(layer, []))}")
         self.layers[layer].append(artist)
         return artist
 
@@ -326,7 +360,7 @@ class _Painter:
                             near, far = border - outward, border + outward
                             solid.append(far if out else near)
                             dashed.extend(_dashes(near if out else far, shape.road_s, period))
-                    elif oncoming is not None:
+                    elif oncoming in lanes and lanes[oncoming].type in _TRAFFIC:
                         centre.append(border)
                     else:
                         edge.append(border)
@@ -366,7 +400,7 @@ class _Painter:
                     xy = shape.at(s, shape.centre)
                     if not self.visible(xy):
                         continue
-                    heading = float(lane.pose(s)[1])
+                    heading = shape.heading_at(s)
                     if length > 4.0:  # wider than a lane: neighbours share an arrow
                         octant = round(heading / (math.pi / 4)) % 8
                         cell = (int(xy[0] // (0.8 * spacing)), int(xy[1] // (0.8 * spacing)), octant)
@@ -416,7 +450,7 @@ class _Painter:
                     # Near the exit, where paths have parted.
                     long = [m for m in members if m.lane.length > 3 * length]
                     places = [m.at(0.8 * m.lane.length, m.centre) for m in long]
-                    headings = [float(m.lane.pose(0.8 * m.lane.length)[1]) for m in long]
+                    headings = [m.heading_at(0.8 * m.lane.length) for m in long]
                     if long:
                         darts = _darts(np.array(places), np.array(headings), length, 0.7 * length)
                         self.areas("connectors", darts, level + 0.61, facecolors=color, linewidths=0)
@@ -470,13 +504,17 @@ class _Painter:
             self.legend["crosswalk"] = {"zebra": True}
 
     def _walk_direction(self, spans: Sequence[tuple[str, float, float]], outline: Array) -> Array:
-        """Unit vector across the traffic that a crosswalk interrupts, else along its longer side."""
-        for lane, s_in, s_out in spans:
-            if lane in self.network.lanes:
-                heading = float(self.network.lanes[lane].pose(0.5 * (s_in + s_out))[1])
-                return np.array([-math.sin(heading), math.cos(heading)])
-        _, _, axes = np.linalg.svd(outline - outline.mean(0), full_matrices=False)
-        return axes[0]
+        """Unit vector along the walk: the axis of the outline that crosses the traffic, else the longer."""
+        edges = np.roll(outline, -1, 0) - outline
+        longest = edges[np.argmax(np.hypot(*edges.T))]
+        axis = longest / np.hypot(*longest)
+        axes = np.array([axis, [-axis[1], axis[0]]])
+        lanes = [(self.network.lanes.get(lane), 0.5 * (a + b)) for lane, a, b in spans]
+        headings = [np.interp(s, lane.s, lane.heading) for lane, s in lanes if lane is not None]
+        if not headings:
+            return axis
+        across = np.stack([-np.sin(headings), np.cos(headings)], -1)
+        return axes[np.argmax(np.abs(across @ axes.T).sum(0))]
 
     def stops(self) -> None:
         """Stop lines of the file, and the ends of lanes that lights or signs hold."""
@@ -534,7 +572,7 @@ class _Painter:
 
     def signs(self) -> None:
         top = max(self.levels.values(), default=0)
-        size = self.points(2.2, 3.0, 11.0)
+        size = self.points(2.8, 3.0, 11.0)
         styles: dict[SignKind, tuple[str, dict[str, Any]]] = {
             SignKind.OTHER: (
                 "other sign",
@@ -559,7 +597,7 @@ class _Painter:
             edge = max(0.5, 0.14 * size)
             self.scatter("signs", [s.position[:2] for s in signs], own, top + 0.82, linewidths=edge, **style)
             self.legend[label] = {"marker": style}
-            if kind is SignKind.SPEED and size > 6.0:
+            if kind is SignKind.SPEED and size > 5.5:
                 for sign in signs:
                     if sign.value is not None:
                         text = f"{sign.value * 3.6:.0f}"
@@ -622,7 +660,7 @@ class _Painter:
             s = 0.5 * (shape.s[seen[0]] + shape.s[seen[-1]]) if len(seen) > 1 else 0.5 * shape.lane.length
             xy = shape.at(s, shape.centre)
             if self.visible(xy) and room(xy, road):
-                angle = math.degrees(float(shape.lane.pose(s)[1])) % 180
+                angle = math.degrees(shape.heading_at(s)) % 180
                 angle -= 180 if angle > 90 else 0
                 self.text("labels", xy, road, top + 0.90, fontsize=size, rotation=angle)
 
@@ -646,40 +684,6 @@ def _prepare(network: Network) -> tuple[dict[str, _Shape], dict[str, int]]:
         raise MapError("nothing to draw: the map has no lanes", file=network.source)
     shapes = {id_: _shape(lane) for id_, lane in network.lanes.items()}
     return shapes, _levels(shapes.values())
-
-
-def _paint(
-    ax: Axes,
-    network: Network,
-    shapes: dict[str, _Shape],
-    levels: dict[str, int],
-    bounds: Bounds,
-    *,
-    conflicts: bool,
-    labels: bool,
-) -> _Painter:
-    ax.set_aspect("equal", adjustable="box")
-    ax.set_xlim(bounds[0], bounds[2])
-    ax.set_ylim(bounds[1], bounds[3])
-    figure = ax.get_figure(root=True)
-    assert figure is not None
-    extent = ax.get_window_extent()
-    pixels = min(extent.width / (bounds[2] - bounds[0]), extent.height / (bounds[3] - bounds[1]))
-    seen = {id_: shape for id_, shape in shapes.items() if shape.meets(bounds)}
-    painter = _Painter(ax, network, seen, levels, pixels * _POINT / figure.dpi, bounds)
-    painter.surfaces()
-    painter.marks()
-    painter.arrows()
-    painter.connectors(faint=conflicts)
-    if conflicts:
-        painter.conflicts()
-    painter.crosswalks()
-    painter.stops()
-    painter.lights()
-    painter.signs()
-    if labels:
-        painter.labels()
-    return painter
 
 
 def draw_network(
@@ -712,7 +716,9 @@ def draw_network(
     """
     shapes, levels = _prepare(network)
     view = _view(network, shapes, bounds)
-    return _paint(ax, network, shapes, levels, view, conflicts=conflicts, labels=labels).layers
+    painter = _Painter(ax, network, shapes, levels, view)
+    painter.paint(conflicts=conflicts, labels=labels)
+    return painter.layers
 
 
 def _view(network: Network, shapes: dict[str, _Shape], bounds: Bounds | None) -> Bounds:
@@ -792,13 +798,13 @@ def _strips(
         return boxes, scale
 
     best, scale = cut(1)
-    for count in range(2, 17):
+    for count in range(2, 15):
         boxes, larger = cut(count)
         short = boxes[0][3 - axis] - boxes[0][1 - axis]
         if scale >= _CLEAR or long / count < 0.8 * short:
             break
         thin = long > 2.5 * (high - low) or short < 0.6 * (high - low)
-        if thin and larger > 1.25 * scale:
+        if thin and larger > 1.1 * scale:
             best, scale = boxes, larger
     return best, wide, scale
 
@@ -815,7 +821,8 @@ def draw_map(
 ) -> Figure:
     """Draw a map on a page: title with counts and the import report, legend, scale bar, axes in metres.
 
-    Lanes keep their true proportions. A long thin map is cut into strips that share one scale.
+    Lanes keep their true proportions. A long thin map is cut into strips that share one scale. Where
+    the scale of the whole map is too small to read its marks, windows below show details.
 
     Args:
         network: the map.
@@ -849,38 +856,61 @@ def draw_map(
     strips, stacked, scale = _strips(shapes, view, room)
     wide, tall = strips[0][2] - strips[0][0], strips[0][3] - strips[0][1]
     rows, columns = (len(strips), 1) if stacked else (1, len(strips))
+    windows: list[Bounds] = []
+    detail = 0.0  # in, side of the windows below the map
     if size is None:
         used = rows * tall * scale + (rows - 1) * _GAP, columns * wide * scale + (columns - 1) * _GAP
-        page = (max(9.0, used[1] + left + _LEGEND), max(4.2, used[0] + bottom + top))
-        room = (page[0] - left - _LEGEND, page[1] - bottom - top)
+        room = (max(6.0, used[1]), max(2.8, used[0]))
+        if bounds is None and scale < _CLEAR:
+            count = max(2, round(room[0] / 2.8))
+            detail = (room[0] - (count - 1) * _GAP) / count
+            windows = _details(network, shapes, count, 0.8 * detail / scale)
+        lower = detail + bottom if windows else 0.0
+        page = (room[0] + left + _LEGEND, room[1] + bottom + top + lower)
+    else:
+        lower = 0.0
 
     figure = Figure(figsize=page, dpi=dpi, facecolor="white")
     cell = (room[0] - (columns - 1) * _GAP) / columns, (room[1] - (rows - 1) * _GAP) / rows
     legend: dict[str, dict[str, Any]] = {}
+
+    def panel(place: Bounds, box: Bounds, name: str) -> Axes:
+        """Axes at x, y, width, height (inches) that show a box (m)."""
+        x, y, width, height = place
+        ax = figure.add_axes((x / page[0], y / page[1], width / page[0], height / page[1]))
+        painter = _Painter(ax, network, shapes, levels, box, name)
+        painter.paint(conflicts=conflicts, labels=labels)
+        legend.update(painter.legend)
+        ax.set_facecolor("#fbfbf9")
+        ax.tick_params(labelsize=7, colors=INK, length=2.5)
+        ax.ticklabel_format(useOffset=False, style="plain")
+        ax.xaxis.set_major_locator(MaxNLocator(max(2, int(width / 0.9))))
+        ax.yaxis.set_major_locator(MaxNLocator(max(1, int(height / 0.45))))
+        ax.spines[:].set_color("#c5cad1")
+        return ax
+
+    overview = []
     for i, strip in enumerate(strips):
         row, column = (i, 0) if stacked else (0, i)
-        x = left + column * (cell[0] + _GAP)
-        y = bottom + (rows - 1 - row) * (cell[1] + _GAP)
-        ax = figure.add_axes((x / page[0], y / page[1], cell[0] / page[0], cell[1] / page[1]))
-        ax.set_anchor("C")
         # Room that a strip does not need shows its surroundings, but never its neighbours.
         alone = len(strips) == 1
         spare_x = max(0.0, cell[0] / scale - wide) / 2 if alone or not stacked else 0.0
         spare_y = max(0.0, cell[1] / scale - tall) / 2 if alone or stacked else 0.0
         box = (strip[0] - spare_x, strip[1] - spare_y, strip[2] + spare_x, strip[3] + spare_y)
-        painter = _paint(ax, network, shapes, levels, box, conflicts=conflicts, labels=labels)
-        legend |= painter.legend
-        ax.set_facecolor("#fbfbf9")
-        ax.tick_params(labelsize=7, colors=INK, length=2.5)
-        ax.ticklabel_format(useOffset=False, style="plain")
-        ax.xaxis.set_major_locator(MaxNLocator(max(2, int(cell[0] / 0.9))))
-        ax.yaxis.set_major_locator(MaxNLocator(max(1, int(cell[1] / 0.45))))
-        for spine in ax.spines.values():
-            spine.set_color("#c5cad1")
+        x = left + column * (cell[0] + _GAP)
+        y = lower + bottom + (rows - 1 - row) * (cell[1] + _GAP)
+        ax = panel((x, y, *cell), box, f"map{i}-")
         if row == rows - 1:
             ax.set_xlabel("x / m", fontsize=8, color=INK)
         if column == 0:
             ax.set_ylabel("y / m", fontsize=8, color=INK)
+        overview.append(ax)
+    for i, window in enumerate(windows):
+        letter = "ABCDEFGH"[i]
+        ax = panel((left + i * (detail + _GAP), bottom, detail, detail), window, f"detail{letter}-")
+        ax.set_title(letter, fontsize=9, weight="bold", color=INK, loc="left", pad=3)
+        for ax in overview:
+            _frame(ax, window, letter)
 
     _title(figure, network, len(strips))
     _legend(figure, legend)
@@ -888,6 +918,56 @@ def draw_map(
     if target is not None:
         _write(figure, target, dpi)
     return figure
+
+
+def _details(network: Network, shapes: dict[str, _Shape], count: int, most: float) -> list[Bounds]:
+    """Square windows on what a small scale hides: the busiest junctions, then lanes of varying width.
+
+    `most` is the side (m) from which on a window would show no more than the map itself.
+    """
+    places: list[tuple[Array, float]] = []  # middle and side
+    busy = sorted(network.junctions.values(), key=lambda j: -len(j.movements))
+    for junction in busy:
+        inside = [shapes[c].polygon for c in junction.connectors if shapes[c].lane.drivable]
+        if inside:
+            low, high = np.concatenate(inside).min(0), np.concatenate(inside).max(0)
+            places.append((0.5 * (low + high), float(max(high - low)) + 16.0))
+    lanes = [s for s in shapes.values() if s.lane.drivable and s.lane.junction is None]
+    for shape in sorted(lanes, key=lambda s: (-round(float(np.ptp(s.lane.width))), -s.lane.length)):
+        places.append((shape.at(0.5 * shape.lane.length, shape.centre), 80.0))
+    windows: list[Bounds] = []
+    for (x, y), side in places:
+        half = 0.5 * min(max(side, 40.0), 140.0, most)
+        window = (float(x - half), float(y - half), float(x + half), float(y + half))
+        apart = all(
+            window[2] < w[0] or w[2] < window[0] or window[3] < w[1] or w[3] < window[1] for w in windows
+        )
+        if apart and len(windows) < count:
+            windows.append(window)
+    return windows
+
+
+def _frame(ax: Axes, window: Bounds, letter: str) -> None:
+    """Mark a detail window on the map where its middle is in view."""
+    from matplotlib.patches import Rectangle
+
+    x0, y0, x1, y1 = window
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    if left <= (x0 + x1) / 2 <= right and bottom <= (y0 + y1) / 2 <= top:
+        style = {"facecolor": "none", "edgecolor": INK, "linewidth": 0.8, "linestyle": (0, (4, 2))}
+        ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, zorder=TRAFFIC_ZORDER - 2, **style))
+        ax.annotate(
+            letter,
+            (x0, y1),
+            xytext=(-1, 1),
+            textcoords="offset points",
+            ha="right",
+            fontsize=9,
+            weight="bold",
+            color=INK,
+            zorder=TRAFFIC_ZORDER - 1,
+            clip_on=True,
+        )
 
 
 def _checked_target(path: str | Path) -> Path:
@@ -936,8 +1016,9 @@ def _title(figure: Figure, network: Network, strips: int) -> None:
     totals = ", ".join(f"{network.report.total(action)} {action.value}" for action in Action)
     width, height = figure.get_size_inches()
     x = _MARGINS[0] / width
-    name = network.name or Path(network.source).stem
-    figure.text(x, 1 - 0.30 / height, name, fontsize=13, weight="bold", color=INK)
+    file = Path(network.source).name
+    name = network.name if network.name and network.name != file.split(".")[0] else ""
+    figure.text(x, 1 - 0.30 / height, f"{file}   {name}".strip(), fontsize=13, weight="bold", color=INK)
     figure.text(x, 1 - 0.53 / height, counts, fontsize=8.5, color=INK)
     figure.text(x, 1 - 0.73 / height, f"import report: {totals}", fontsize=8.5, color=EDGE)
 
@@ -1004,12 +1085,12 @@ def _legend(figure: Figure, entries: dict[str, dict[str, Any]]) -> None:
 def _scale_bar(figure: Figure, scale: float) -> None:
     from matplotlib.lines import Line2D
 
-    most = (_LEGEND - 0.8) / scale  # m that fit beside the legend
+    most = (_LEGEND - 0.8) / scale  # m that fit above the legend
     unit = 10.0 ** math.floor(math.log10(most))
     metres = max(m for m in (unit, 2 * unit, 5 * unit) if m <= most)
     width, height = figure.get_size_inches()
     x0 = width - _LEGEND + 0.15
-    x1, y = x0 + metres * scale, 0.12
+    x1, y = x0 + metres * scale, height - 0.62
     for xs, ys in (((x0, x1), (y, y)), ((x0, x0), (y, y + 0.07)), ((x1, x1), (y, y + 0.07))):
         bar = Line2D([x / width for x in xs], [v / height for v in ys], color=INK, lw=1.5)
         figure.add_artist(bar)
