@@ -52,6 +52,7 @@ RESOLUTION = 0.01  # m, what two decimals resolve: netconvert's default precisio
 BEND_SHARE = 0.1  # share of the lane width by which our curve may leave the shape of an ordinary lane
 MAX_BEND = math.radians(100.0)  # rad, a sharper turn at one vertex is a corner, not a sample of a bend
 SPIKE = math.radians(150.0)  # rad, a sharper turn folds the lane back over itself
+KINK = 5.0  # degrees between a lane and the next, from which on it is reported
 SAMPLE_ERROR = 5e-5  # m, of cubic Hermite interpolation between the samples of a lane
 STEP = 1e-3  # m, between two samples that bracket a jump of curvature
 
@@ -116,6 +117,9 @@ _TYPE_OF_CLASSES = (
     (_SPECIAL_RIGHTS | {"custom1", "custom2"}, LaneType.RESTRICTED),
 )
 """Lane type by the first group of classes of which one is allowed, on lanes without general motor traffic."""
+
+_DRIVEN = frozenset({"normal", "internal"})
+"""Functions of edges whose lanes are ways for vehicles."""
 
 _UNUSED_TYPES = frozenset("shoulder border stop restricted parking median curb sidewalk".split())
 
@@ -481,7 +485,7 @@ def fit_polyline(
        the vertex is a corner: an arc rounds it off that leaves the vertex by `tolerance` or takes half
        of the shorter segment.
     4. Headings at the ends are those of the first and last segment. Where a heading (rad) is given and
-       differs from the segment by no more than the polyline turns at the next vertex, the segment is the
+       differs from the segment by no more than 1.5 of the turn at the next vertex, the segment is the
        first chord of a bend and the given heading is taken.
 
     `points` are at least two, with no two equal in a row.
@@ -565,7 +569,7 @@ def _end_heading(segment: float, given: float | None, turn: Float[Array, " J"]) 
     """The given heading if the end segment can be a chord of a bend that has it, else the segment's."""
     if given is None or not len(turn):
         return segment
-    return given if abs(_wrap(given - segment)) <= abs(float(turn[0])) else segment
+    return given if abs(_wrap(given - segment)) <= 1.5 * abs(float(turn[0])) else segment
 
 
 def distance_to_polyline(xy: Float[Array, "M 2"], points: Float[Array, "K 2"]) -> Float[Array, " M"]:
@@ -963,6 +967,7 @@ class _Reader:
         programs = self._programs(movements)
         stop_lines, lights = self._stop_positions(movements, lanes)
         crosswalks = self._crosswalks(lanes)
+        self._report_kinks(lanes)
         noted = {note.where for note in self.report.notes if note.element == "lane"}
         self.report.read("lane", len(lanes) - len(noted))
         self.xml.summarise()
@@ -1064,15 +1069,14 @@ class _Reader:
                 back[target].append(lane_id)
         result = {}
         for edge in self.edges.values():
-            knots = self._road_knots(edge, curves)
-            for lane, (curve, lo, hi, vertex_s) in ((lane, curves[lane.id]) for lane in edge.lanes):
+            sampled = []
+            for curve, lo, hi, _ in (curves[lane.id] for lane in edge.lanes):
                 at = curve.samples(lo, hi)
-                xy, heading, curvature = curve.at(at)
-                s = at - lo
-                z = np.interp(s, vertex_s, lane.points[:, 2])
-                road_s = (
-                    s * (edge.lanes[0].length / s[-1]) if knots is None else np.interp(s, vertex_s, knots)
-                )
+                sampled.append((at - lo, *curve.at(at)))
+            middle = sampled[len(sampled) // 2][:3]
+            for lane, (s, xy, heading, curvature) in zip(edge.lanes, sampled, strict=True):
+                z = np.interp(s, curves[lane.id][3], lane.points[:, 2])
+                road_s = self._along_road(edge, middle, s, xy)
                 left, right = self._neighbours(lane)
                 result[lane.id] = Lane(
                     id=lane.id,
@@ -1099,6 +1103,21 @@ class _Reader:
                 )
         return result
 
+    def _report_kinks(self, lanes: dict[str, Lane]) -> None:
+        """Report where lanes that meet do so at an angle: the file has them so, and no lane can mend it."""
+        kinks = []
+        for lane in lanes.values():
+            for other in (lanes[target] for target in lane.successors):
+                if self.edges[lane.road].function in _DRIVEN and self.edges[other.road].function in _DRIVEN:
+                    meet = np.hypot(*(other.xyz[0] - lane.xyz[-1])[:2]) < 0.1
+                    angle = abs(math.degrees(_wrap(other.heading[0] - lane.heading[-1])))
+                    if meet and angle > KINK:
+                        kinks.append((angle, lane.id, other.id))
+        if kinks:
+            angle, lane_id, other_id = max(kinks)
+            message = f"{len(kinks)} joints have kinks of more than {KINK:g} degrees, up to {angle:.1f}"
+            self.report.approximated("lane@joint", f"{lane_id} to {other_id}", message)
+
     def _access(self, lane: _Lane) -> frozenset[str]:
         """Classes of SUMO by their names, and those of the engine that go by other names."""
         extra = {ENGINE_CLASS[c] for c in ("passenger", "delivery") if c in lane.allowed}
@@ -1123,7 +1142,7 @@ class _Reader:
 
     def _neighbours(self, lane: _Lane) -> tuple[_Lane | None, _Lane | None]:
         """Left and right. Index 0 lies at the edge of the road: on the left with left-hand traffic."""
-        if lane.edge.function not in {"normal", "internal"}:
+        if lane.edge.function not in _DRIVEN:
             return None, None
         lanes = lane.edge.lanes
         inner = lanes[lane.index + 1] if lane.index + 1 < len(lanes) else None
@@ -1264,15 +1283,36 @@ class _Reader:
                 return float(np.arctan2(*(points[1] - points[0])[1::-1]))
         return 0.0
 
-    def _road_knots(self, edge: _Edge, curves: dict[str, Any]) -> Float[Array, " K"] | None:
-        """Coordinate along the edge (m) of the vertices of its lanes, which lie abreast of one another.
+    def _along_road(
+        self, edge: _Edge, middle: tuple[Array, Array, Array], s: Array, xy: Array
+    ) -> Float[Array, " M"]:
+        """Coordinate along the edge (m) of the samples of a lane: that of the middle lane abreast of them.
 
-        None where the lanes have different numbers of vertices: then it is proportional to arc length.
+        `middle` is its s, xy and heading. Where a lane reaches beyond the ends of the middle one, the
+        coordinate goes on below 0 or above the length of the edge.
         """
-        if len({len(lane.points) for lane in edge.lanes}) > 1:
-            return None
-        share = np.mean([curves[lane.id][3] / curves[lane.id][3][-1] for lane in edge.lanes], axis=0)
-        return share * edge.lanes[0].length
+        s_ref, xy_ref, heading_ref = middle
+        scale = edge.lanes[0].length / s_ref[-1]
+        if s is s_ref:
+            return s * scale
+        p, start = xy @ (1, 1j), xy_ref[:-1] @ (1, 1j)
+        chord = np.diff(xy_ref @ (1, 1j))
+        offset = p[:, None] - start
+        u = (offset * (chord.conj() / np.abs(chord) ** 2)).real
+        inside = np.clip(u, 0.0, 1.0)
+        s_near = s_ref[:-1] + inside * np.diff(s_ref)
+        # Where the edge runs past itself the nearest point may be on another stretch of it.
+        expected = s * (s_ref[-1] / s[-1])
+        far = np.abs(s_near - expected[:, None]) > 20.0 + 0.1 * s_ref[-1]
+        distance = np.where(far, np.inf, np.abs(offset - inside * chord))
+        found = s_near[np.arange(len(p)), distance.argmin(1)]
+        for end, beyond in ((0, -1.0), (-1, 1.0)):  # tangents carry the middle lane on at both ends
+            tangent = np.exp(1j * heading_ref[end])
+            ahead = ((p - xy_ref[end] @ (1, 1j)) * tangent.conjugate()).real
+            outside = (found == s_ref[end]) & (beyond * ahead > 0)
+            found = np.where(outside, found + ahead, found)
+        rising = np.maximum.accumulate(found)
+        return rising * scale
 
     # ---- junctions
 
