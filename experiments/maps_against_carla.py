@@ -463,7 +463,9 @@ def compare_permissions(
     }
 
 
-def compare_formulas(ours: OurMap, truth: OpenDriveFormulas, row: Comparison) -> None:
+def compare_formulas(
+    ours: OurMap, truth: OpenDriveFormulas, published: float | None, row: Comparison
+) -> None:
     """Our driving lanes at the formulas' places, and their length."""
     lateral, headings, widths, device, lost, broken, bridged, count = [], [], [], [], [], 0, 0, 0
     for road in truth.roads.values():
@@ -516,7 +518,6 @@ def compare_formulas(ours: OurMap, truth: OpenDriveFormulas, row: Comparison) ->
     length = sum(lane.length for lanes in ours.lanes.values() for lane in lanes)
     exact = truth.driving_length()
     row.figures["driving_km"], row.figures["length_error"] = exact / 1e3, length / exact - 1 if exact else 0.0
-    published = published_lengths().get(row.map)
     row.figures["published_km"] = published
     if abs(length - exact) > LENGTH * exact + 1e-3:
         row.misses.append(f"driving lanes are {length:.3f} m, by the formulas {exact:.3f} m")
@@ -525,8 +526,8 @@ def compare_formulas(ours: OurMap, truth: OpenDriveFormulas, row: Comparison) ->
         row.misses.append(f"driving lanes are {length / 1e3:.3f} km, published {published} km")
 
 
-def published_lengths() -> dict[str, float]:
-    """Map -> driving km in the table that comes with the shared maps."""
+def published_lengths() -> dict[Path, float]:
+    """Driving km of the shared maps in the table that comes with them."""
     readme = SHARED / "opendrive" / "README.md"
     if not readme.is_file():
         return {}
@@ -539,7 +540,7 @@ def published_lengths() -> dict[str, float]:
     found = {}
     for line in table:
         if re.fullmatch(r"`\S+\.xodr`", line[0]) and re.fullmatch(r"[\d.]+", line[column]):
-            found[line[0].strip("`").removesuffix(".xodr")] = float(line[column])
+            found[readme.parent / line[0].strip("`")] = float(line[column])
     return found
 
 
@@ -644,7 +645,7 @@ def compare_marks(ours: OurMap, carla_map: CarlaMap, truth: OpenDriveFormulas, r
             row.exceptions.append(f"{title}: {count} name no driving lane in the file, placed by position")
         if beside:
             row.exceptions.append(
-                f"{title}: {len(beside)} connectors beside or behind those that the file names: {listed(beside)}"
+                f"{title}: {len(beside)} connectors that leave the same lane as those named: {listed(beside)}"
             )
         for word, lanes in (("missing", in_file - mine), ("extra", mine - in_file - placed - beside)):
             if lanes:
@@ -722,7 +723,7 @@ def compare(source: Path, network: Network, carla_map: CarlaMap) -> Comparison:
     if carla_map.failure is None and integer_ids(truth.roads) is None:
         row.failure = "casts the ids of roads to integers"
     ours = OurMap(network)
-    compare_formulas(ours, truth, row)
+    compare_formulas(ours, truth, published_lengths().get(source), row)
     compare_poses(ours, carla_map, truth, row)
     compare_movements(ours, carla_map, truth, row)
     compare_marks(ours, carla_map, truth, row)

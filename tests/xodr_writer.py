@@ -65,7 +65,7 @@ def profile(
     draw: st.DrawFn, tag: str, start: str, length: float, low: float, high: float, base: float = 0.0
 ) -> list[Element]:
     """Continuous cubic records over `[base, base + length]` with values about `low` to `high`."""
-    breaks = sorted({0.0, *draw(st.lists(number(0.1, 0.9), max_size=2))})
+    breaks = sorted({0.0, *(k / 10 for k in draw(st.sets(st.integers(1, 9), max_size=2)))})
     values = [draw(number(low, high)) for _ in range(len(breaks) + 1)]
     records = []
     for i, at in enumerate(breaks):
@@ -142,9 +142,12 @@ speeds = st.builds(Speed, number(5, 130), st.sampled_from(sorted(TO_MS)))
 
 @st.composite
 def lane(draw: st.DrawFn, id_: int, length: float, border: float | None = None) -> Element:
-    """<lane> with width records, or border records when the inner border is given."""
-    low, high = (1.6, 4.6) if border is None else (border + 1.0, border + 4.0)
-    records = draw(profile("width" if border is None else "border", "sOffset", length, low, high))
+    """<lane> with width records, or border records when the (unsigned) inner border is given."""
+    if border is None:
+        records = draw(profile("width", "sOffset", length, 1.6, 4.6))
+    else:  # borders are t: negative right of the reference line
+        low, high = sorted(math.copysign(border + by, id_) for by in (1.0, 4.0))
+        records = draw(profile("border", "sOffset", length, low, high))
     element = node(
         "lane", node("link"), *records, id=id_, type=draw(st.sampled_from(LANE_TYPES)), level="false"
     )
