@@ -193,10 +193,13 @@ class Cutter:
             changes = {section.s + r for lane in section.lanes.values() for r in _changes(lane)}
             changes |= {s for s, _, _ in road.types}
             jumps = self._jumps(shape, section, start, end)
-            cuts = sorted({s for s in changes | jumps | extra if start + MIN_SECTION < s < end - MIN_SECTION})
-            edges = [start, *cuts, end]
+            edges = [start]
+            for s in sorted(changes | jumps | extra):
+                if edges[-1] + MIN_SECTION < s < end - MIN_SECTION:
+                    edges.append(s)
+            edges.append(end)
             for a, b in itertools.pairwise(edges):
-                atoms.append((k, section, a, b, a in jumps or _near(a, extra)))
+                atoms.append((k, section, a, b, _near(a, jumps) or _near(a, extra)))
 
         pieces: list[Piece] = []
         current: list[tuple[int, RawSection, float, float]] = []
@@ -501,11 +504,8 @@ def sample_piece(road: RawRoad, piece: Piece, report: ImportReport) -> dict[int,
     turn = np.abs(np.angle(np.exp(1j * (after.heading - before.heading)))).max(0, initial=0.0)
     step = np.abs(after.width - before.width).max(0, initial=0.0)
     kink = (jump > 1e-6) | (turn > 1e-5) | (step > 1e-6)
-    room = (b - a) / 4
     half = np.where(kink, np.maximum(5e-4, _BRIDGE / 2 * np.maximum(jump - 1e-5, 0.0)), 0.0)
-    half = np.minimum(half, np.minimum(room[:-1], room[1:]))
-    start = a + np.concatenate([[0.0], half])
-    end = b - np.concatenate([half, [0.0]])
+    start, end = _leave_out(a, b, half)
     for s, gap in zip(b[:-1][jump > 1e-3], jump[jump > 1e-3], strict=True):
         report.approximated(
             "lane geometry",
@@ -516,14 +516,16 @@ def sample_piece(road: RawRoad, piece: Piece, report: ImportReport) -> dict[int,
 
     count = _intervals(shape, evaluate, start, end)
     s_list, span_list, bridge_list = [], [], []
-    for i, n in enumerate(count):
-        s = np.linspace(start[i], end[i], n + 1)
-        bridged = i > 0 and half[i - 1] > 0.0
-        if i > 0 and not bridged:  # the last sample of the span before is this one
+    reached = start[0]
+    for i in np.nonzero(end > start)[0]:
+        s = np.linspace(start[i], end[i], count[i] + 1)
+        bridged = start[i] > reached
+        if s_list and not bridged:  # the last sample of the span before is this one
             s = s[1:]
+        bridge_list.append(np.arange(len(s)) < bridged)
         s_list.append(s)
         span_list.append(np.full(len(s), i))
-        bridge_list.append(np.arange(len(s)) < bridged)
+        reached = end[i]
     s, span, bridge = (np.concatenate(parts) for parts in (s_list, span_list, bridge_list))
     values = evaluate(s, span)
     z = road.elevation(s, middle[span])
@@ -559,6 +561,19 @@ def sample_piece(road: RawRoad, piece: Piece, report: ImportReport) -> dict[int,
             junction=road.junction,
         )
     return lanes
+
+
+def _leave_out(a: Array, b: Array, half: Array) -> tuple[Array, Array]:
+    """The part of every span `[a, b]` that is further than `half` from the borders between spans.
+
+    Spans that are swallowed whole come back with start >= end.
+    """
+    border = b[:-1]
+    half = np.minimum(half, np.minimum(border - a[0], b[-1] - border) / 2)
+    start, end = a.copy(), b.copy()
+    start[1:] = np.maximum(a[1:], np.maximum.accumulate(border + half))
+    end[:-1] = np.minimum(b[:-1], np.minimum.accumulate((border - half)[::-1])[::-1])
+    return start, end
 
 
 def _evaluate(
