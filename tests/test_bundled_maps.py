@@ -241,18 +241,22 @@ def converted(name: str, sumo_tools: Path, tmp_path_factory: pytest.TempPathFact
     return net
 
 
-def test_netconvert_keeps_lanes_and_limits(converted: Path, network: Network):
-    """The edges of all drivable lanes outside junctions are there, with their limits."""
-    edges = [edge for edge in etree.parse(converted).getroot().iter("edge") if not edge.get("function")]
-    theirs = {
-        (edge.get("id", ""), float(lane.get("speed", ""))) for edge in edges for lane in edge.iter("lane")
-    }
+def test_netconvert_sees_the_same_lanes(converted: Path, network: Network):
+    """Widths (of lanes that do not taper) and limits, per road and direction."""
+    theirs, ours, limits = set(), set(), set()
+    for edge in etree.parse(converted).getroot().iter("edge"):
+        if not edge.get("function"):
+            road = edge.get("id", "").split("#")[0]
+            lanes = [(lane.get("width", ""), lane.get("speed", "")) for lane in edge.iter("lane")]
+            theirs |= {(road, float(width), float(speed)) for width, speed in lanes}
     for lane in network.drivable_lanes():
         if lane.junction is None:
-            edge = f"-{lane.road}" if lane.number < 0 else lane.road
-            assert any(id.split("#")[0] == edge and abs(v - lane.speed_limit) < 0.01 for id, v in theirs), (
-                lane.id
-            )
+            road = f"-{lane.road}" if lane.number < 0 else lane.road
+            limits.add((road, round(lane.speed_limit, 2)))
+            if np.ptp(lane.width) < 1e-6:
+                ours.add((road, round(float(lane.width[0]), 2), round(lane.speed_limit, 2)))
+    assert ours and ours <= theirs
+    assert {(road, speed) for road, _, speed in theirs} == limits
 
 
 def test_traffic_runs_in_sumo(name: str, converted: Path, sumo_tools: Path):
