@@ -255,6 +255,7 @@ def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
     import jax
 
     from limsim_jax.maps import lane_map
+    from limsim_jax.maps.routing import default_goals
 
     calls = []
     build = lane_map.build_lane_map
@@ -267,8 +268,8 @@ def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
 
     monkeypatch.setattr(lane_map, "build_lane_map", counted)
     network = lj.load_map(file)
-    goals = [lane.id for lane in network.drivable_lanes() if not lane.successors][:2]
-    assert len(goals) == 2
+    goals = default_goals(network)
+    assert len(goals) >= 2
     first, second = ImportReport(), ImportReport()
     built = lj.build_lane_map(network, report=first)
     kept = lj.build_lane_map(lj.load_map(file), report=second)
@@ -278,10 +279,11 @@ def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
     for a, b in zip(jax.tree.leaves(built), jax.tree.leaves(kept), strict=True):
         assert isinstance(b, jax.Array) and a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
-    lj.build_lane_map(network, goals)
-    lj.build_lane_map(network, goals)
-    lj.build_lane_map(network, goals[::-1])
-    assert calls == [None, goals, goals[::-1]]
+    groups = [list(group) for group in goals.values()]
+    for same in (goals, groups, goals):
+        lj.build_lane_map(network, same)
+    lj.build_lane_map(network, groups[::-1])
+    assert calls == [None, goals, groups[::-1]]
 
 
 def test_network_that_was_changed_is_not_taken_from_the_cache(file, folder):

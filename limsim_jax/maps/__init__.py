@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ from limsim_jax.maps import cache as _cache
 from limsim_jax.maps.network import ImportReport, MapError, Network
 
 if TYPE_CHECKING:
-    from limsim_jax.maps.lane_map import LaneMap
+    from limsim_jax.maps.lane_map import Goals, LaneMap
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -52,7 +52,7 @@ def load_map(path: str | Path, *, cache: bool = True) -> Network:
 
 def build_lane_map(
     network: Network,
-    goals: Sequence[str] | None = None,
+    goals: Goals | None = None,
     *,
     report: ImportReport | None = None,
     cache: bool = True,
@@ -68,7 +68,7 @@ def build_lane_map(
 
     notes = ImportReport()
     identity = _loaded.get(network) if cache else None
-    name = _cache.key("lanes", *(identity or ()), repr(goals if goals is None else list(goals)))
+    name = _cache.key("lanes", *(identity or ()), _spell(goals))
     match _cache.load(name) if identity else None:
         case (lane_map.LaneMap() as arrays, ImportReport() as notes):
             built = jax.device_put(arrays)
@@ -80,6 +80,12 @@ def build_lane_map(
         report.counts.update(notes.counts)
         report.notes.extend(notes.notes)
     return built
+
+
+def _spell(goals: Goals | None) -> str:
+    """Equal for goals that make equal arrays: their names do not matter, their order does."""
+    groups = goals.values() if isinstance(goals, Mapping) else goals
+    return repr(groups and [group if isinstance(group, str) else list(group) for group in groups])
 
 
 def bundled_maps() -> dict[str, Path]:
