@@ -1,0 +1,107 @@
+"""What is fixed for a run (`Config`), for an episode (`Scenario`), and what a step changes (`State`).
+
+Shapes stand at the fields: `N` vehicle slots, `V` vehicles of a schedule, `O` origins. All types
+describe one world; a batch is a `vmap`. SI units, radians, counter-clockwise; `d > 0` is left.
+"""
+
+from __future__ import annotations
+
+import enum
+
+import jax
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Config:
+    """Fixed for a run. All static: another value is another program."""
+
+    dt: float = struct.field(pytree_node=False)  # s, physics step
+    decision_every: int = struct.field(pytree_node=False, default=5)  # physics steps per decision
+    look_ahead: float = struct.field(pytree_node=False, default=150.0)  # m along the route
+    look_ahead_lanes: int = struct.field(pytree_node=False, default=4)  # lanes beyond the own one
+
+    @property
+    def decision_time(self) -> float:
+        """Seconds between two decisions."""
+        return self.dt * self.decision_every
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Driver:
+    """How a vehicle is driven. Paper symbols for paper parameters."""
+
+    speed_factor: Float[Array, " N"]  # desired speed over the speed limit
+    v_max: Float[Array, " N"]  # m/s, what the vehicle or its driver never exceeds
+    T: Float[Array, " N"]  # s, time gap
+    s0: Float[Array, " N"]  # m, standstill gap
+    a: Float[Array, " N"]  # m/s^2, largest acceleration
+    b: Float[Array, " N"]  # m/s^2, comfortable deceleration
+    delta: Float[Array, " N"]  # acceleration exponent
+    b_max: Float[Array, " N"]  # m/s^2, hardest braking
+    coolness: Float[Array, " N"]  # 0..1, trust that the leader does not brake hard (ACC-IDM)
+    politeness: Float[Array, " N"]  # MOBIL p
+    threshold: Float[Array, " N"]  # m/s^2, MOBIL a_th: least advantage of a lane change
+    b_safe: Float[Array, " N"]  # m/s^2, braking that a lane change may ask of the follower
+    keep_right: Float[Array, " N"]  # m/s^2, MOBIL bias towards the right lane (left with left-hand traffic)
+    lane_change_time: Float[Array, " N"]  # s
+    a_lat: Float[Array, " N"]  # m/s^2, lateral acceleration accepted in bends
+    gap_factor: Float[Array, " N"]  # factor on the gaps accepted at junctions
+    svo: Float[Array, " N"]  # rad, social value orientation: 0 egoistic, pi/4 prosocial
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Shape:
+    """Body of a vehicle."""
+
+    length: Float[Array, " N"]  # m
+    width: Float[Array, " N"]  # m
+    wheelbase: Float[Array, " N"]  # m
+    vehicle_class: Int[Array, " N"]  # index into maps.lane_map.VEHICLE_CLASSES
+
+
+class Status(enum.IntFlag):
+    """Bits of `State.status`: what has happened to a vehicle since it entered."""
+
+    COLLIDED = 1
+    OFF_ROAD = 2
+    WRONG_WAY = 4
+    RED_LIGHT = 8  # crossed a stop line on red
+    MISSED_ROUTE = 16  # could not reach the lane that its goal needs
+    NOT_FINITE = 32
+    HARD_BRAKE = 64  # braked harder than its driver's `b_max`
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class State:
+    """What a step changes. A slot that is not `active` holds harmless numbers."""
+
+    step: Int[Array, ""]  # physics steps since the start
+    active: Bool[Array, " N"]
+    vehicle: Int[Array, " N"]  # row of the schedule, -1 for vehicles that were there at the start
+    lane: Int[Array, " N"]
+    previous: Int[Array, " N"]  # lane behind `lane` on which the tail may still be
+    s: Float[Array, " N"]  # m, front bumper along the lane
+    d: Float[Array, " N"]  # m, offset of the vehicle from the centre of the lane, left > 0
+    v: Float[Array, " N"]  # m/s
+    a: Float[Array, " N"]  # m/s^2, of the last step
+    goal: Int[Array, " N"]  # column of the route table
+    # lane change: on the way from (lane, d) to the centre of `target`, or back
+    target: Int[Array, " N"]  # lane to change to, NO_LANE while keeping the lane
+    change_time: Float[Array, " N"]  # s since its start
+    change_from: Float[Array, " N"]  # m, d at its start
+    rest: Float[Array, " N"]  # s until the next lane change may start
+    # junctions
+    waiting: Float[Array, " N"]  # s below walking speed
+    held: Bool[Array, " N"]  # kept at its stop position by the last decision
+    stopped: Bool[Array, " N"]  # has stopped at the stop sign ahead
+    # record
+    distance: Float[Array, " N"]  # m since it entered
+    entered: Float[Array, " N"]  # s, time of entry
+    status: Int[Array, " N"]  # bits of `Status`
+
+
+def gather(tree: jax.Array | object, index: Int[Array, "*b"]) -> object:
+    """Rows `index` of every leaf."""
+    return jax.tree.map(lambda x: x[index], tree)
