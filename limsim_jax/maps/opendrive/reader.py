@@ -22,6 +22,7 @@ from limsim_jax.maps.opendrive.records import (
     RawJunction,
     RawRoad,
 )
+from limsim_jax.maps.signals import generate_programs
 from limsim_jax.maps.xml import Reader, file_hash, read_bytes, top_level
 
 LARGEST = 1e8  # m, coordinates beyond this are not on Earth
@@ -136,7 +137,7 @@ def read_opendrive(path: str | Path) -> Network:
             f"{seam.before} to {seam.after}",
             f"the lanes meet {seam.gap:.3f} m apart and at {np.degrees(abs(seam.kink)):.2f} degrees: kept so",
         )
-    return network
+    return generate_programs(network)
 
 
 def _by_id(records: Iterable[T], tag: str, path: Path) -> dict[str, T]:
