@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("matplotlib")
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -131,7 +131,12 @@ def crossing() -> Network:
             incoming = lanes[f"{arm}_in2" if turn is Turn.RIGHT else f"{arm}_in1"]
             outgoing = lanes["ENWS"[(k + step) % 4] + "_out"]
             via = f"{arm}_{turn.value}"
-            lanes[via] = _bend(via, incoming, outgoing)
+            lanes[via] = _bend(
+                via, incoming, outgoing, predecessors=(incoming.id,), successors=(outgoing.id,)
+            )
+            for lane, field in ((incoming, "successors"), (outgoing, "predecessors")):
+                linked = (*getattr(lanes[lane.id], field), via)
+                lanes[lane.id] = replace(lanes[lane.id], **{field: linked})
             movements.append(
                 Movement(
                     index=len(movements),
@@ -296,6 +301,34 @@ def test_crosswalk_bars_fill_half_of_the_outline_along_the_traffic(crossing):
     for bar in bars:
         assert np.ptp(bar[:, 0]) == pytest.approx(4.0)  # as long as the walk is deep
         assert np.ptp(bar[:, 1]) < 1.5
+
+
+def test_conflict_bands_lie_where_paths_cross(crossing):
+    layers = draw_network(_axes(), crossing, conflicts=True)
+    bands = {
+        to_hex(np.asarray(a.get_facecolor())[0], keep_alpha=False): a.get_paths()
+        for a in layers["conflicts"]
+        if isinstance(a, PolyCollection)
+    }
+    assert set(bands) == {"#56b4e9", "#e69f00", "#d55e00"}  # diverge, merge, cross
+
+    def covered(color: str, x: float, y: float) -> int:
+        return sum(path.contains_point((x, y)) for path in bands[color])
+
+    for x in (-1.75, 1.75):
+        for y in (-1.75, 1.75):
+            assert covered("#d55e00", x, y) >= 2  # both paths that cross there
+    for arm in "ENWS":
+        x, y = crossing.lanes[f"{arm}_right"].pose(6.0)[0][:2]
+        assert covered("#d55e00", x, y) == 0  # right turns cross nothing
+        x, y = crossing.lanes[f"{arm}_left"].pose(0.3)[0][:2]
+        assert covered("#56b4e9", x, y) >= 2  # left and straight leave the same lane
+        x, y = crossing.lanes[f"{arm}_out"].pose(0.0)[0][:2] * 0.98
+        assert covered("#e69f00", x, y) >= 2
+
+
+def test_spans_are_joined_where_they_overlap():
+    assert draw._joined([(4.0, 5.0), (0.0, 2.0), (1.0, 3.0), (3.0, 3.5)]) == [(0.0, 3.5), (4.0, 5.0)]
 
 
 def test_speed_signs_show_their_number(crossing):

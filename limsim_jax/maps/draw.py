@@ -121,11 +121,13 @@ class _Shape:
         """Direction of travel (rad) at arc length `s` (m, clipped)."""
         return float(np.interp(s, self.s, self.heading))
 
-    def stretch(self, s_in: float, s_out: float) -> Array:
-        """Outline `[K, 2]` of the surface between two arc lengths (m)."""
+    def stretch(self, s_in: float, s_out: float, share: float) -> Array:
+        """Outline `[K, 2]` of the middle share of the surface between two arc lengths (m)."""
         inside = self.s[(self.s > s_in) & (self.s < s_out)]
         s = np.concatenate([[s_in], inside, [s_out]])
-        return np.concatenate([self.at(s, self.left), self.at(s, self.right)[::-1]])
+        centre = self.at(s, self.centre)
+        left, right = (centre + share * (self.at(s, side) - centre) for side in (self.left, self.right))
+        return np.concatenate([left, right[::-1]])
 
 
 def _shape(lane: Lane) -> _Shape:
@@ -155,6 +157,17 @@ def _levels(shapes: Iterable[_Shape]) -> dict[str, int]:
     low, high = min(height.values()), max(height.values())
     storey = max(3.0, (high - low) / 12)  # m, below the clearance of any bridge for cars unless steep
     return {lane: int((z - low) / storey) for lane, z in height.items()}
+
+
+def _joined(spans: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The union of intervals, ascending."""
+    union: list[tuple[float, float]] = []
+    for start, end in sorted(spans):
+        if union and start <= union[-1][1]:
+            union[-1] = (union[-1][0], max(end, union[-1][1]))
+        else:
+            union.append((start, end))
+    return union
 
 
 def _dashes(line: Array, road_s: Array, period: float) -> Array:
@@ -439,7 +452,9 @@ class _Painter:
             groups: dict[str, list[_Shape]] = {}
             for shape in shapes:
                 if shape.lane.junction is not None and shape.lane.drivable:
-                    groups.setdefault(turn_of.get(shape.lane.id, "unused connector"), []).append(shape)
+                    groups.setdefault(turn_of.get(shape.lane.id, "connector without movement"), []).append(
+                        shape
+                    )
             for turn, members in groups.items():
                 color = _TURNS[turn][0] if turn in _TURNS else "#000000"
                 style = {"colors": "#8d93a1" if faint else color, "linewidths": width}
@@ -529,6 +544,8 @@ class _Painter:
         placed = {line.spot.lane for line in self.network.stop_lines}
         placed |= {spot.lane for light in self.network.traffic_lights for spot in light.spots}
         placed |= {spot.lane for sign in self.network.signs for spot in sign.spots}
+        # Many files put the heads on the connectors, just behind the lane that they hold.
+        placed |= {m.incoming for m in self.network.movements if placed.intersection(m.via)}
         controls: dict[str, set[Control]] = {}
         for movement in self.network.movements:
             controls.setdefault(movement.incoming, set()).add(movement.control)
@@ -604,7 +621,7 @@ class _Painter:
                         self.text("signs", sign.position[:2], text, top + 0.83, fontsize=0.5 * size)
 
     def conflicts(self) -> None:
-        """Stretches of connectors where paths cross, merge or part (`conflicts.build_conflicts`)."""
+        """Stretches where paths cross, merge or part (`conflicts.build_conflicts`), as bands along them."""
         from limsim_jax.maps.conflicts import ConflictType, build_conflicts
         from limsim_jax.maps.lane_map import lane_rows
 
@@ -613,15 +630,15 @@ class _Painter:
         table = build_conflicts(self.network, rows)
         top = max(self.levels.values(), default=0)
         for order, (kind, color) in enumerate(_CONFLICTS.items()):
-            found = np.argwhere(np.asarray(table.type) == ConflictType[kind.upper()])
-            stretches = [
-                shape.stretch(float(table.s_in[k, c]), float(table.s_out[k, c]))
-                for k, c in found
-                if (shape := self.shapes.get(ids[int(table.lane[k])])) is not None
-            ]
-            zorder = top + 0.63 + 0.01 * order
-            self.areas("conflicts", stretches, zorder, facecolors=color, alpha=0.35, linewidths=0)
-            if stretches:
+            bands: list[Array] = []
+            for k, found in enumerate(np.asarray(table.type) == ConflictType[kind.upper()]):
+                shape = self.shapes.get(ids[int(table.lane[k])])
+                if shape is not None:
+                    spans = zip(table.s_in[k][found].tolist(), table.s_out[k][found].tolist(), strict=True)
+                    bands.extend(shape.stretch(a, b, 0.5) for a, b in _joined(spans))
+            zorder = top + 0.57 + 0.01 * order
+            self.areas("conflicts", bands, zorder, facecolors=color, alpha=0.6, linewidths=0)
+            if bands:
                 self.legend[f"conflict: {kind}"] = {"area": color, "alpha": 0.6}
 
     def labels(self) -> None:
@@ -998,7 +1015,7 @@ def _count(things: Sized, noun: str) -> str:
 def _title(figure: Figure, network: Network, strips: int) -> None:
     drivable = list(network.drivable_lanes())
     km = sum(lane.length for lane in drivable) / 1000
-    signalled = network.traffic_lights or not network.programs
+    own_programs = [p for p in network.programs.values() if not p.generated]
     counts = " · ".join(
         [
             network.format,
@@ -1006,9 +1023,8 @@ def _title(figure: Figure, network: Network, strips: int) -> None:
             _count(network.lanes, "lane"),
             f"{km:.2f} km of driving lanes",
             _count(network.junctions, "junction"),
-            _count(network.traffic_lights, "traffic light")
-            if signalled
-            else _count(network.programs, "signal program"),
+            _count(network.traffic_lights, "traffic light"),
+            *([_count(own_programs, "signal program")] if own_programs else []),
         ]
     )
     if strips > 1:
@@ -1034,7 +1050,7 @@ def _legend(figure: Figure, entries: dict[str, dict[str, Any]]) -> None:
         "crossing forbidden",
         "between directions",
         *_TURNS,
-        "unused connector",
+        "connector without movement",
     ]
     names = [n for n in order if n in entries] + [n for n in entries if n not in order]
     handles: list[Any] = []
