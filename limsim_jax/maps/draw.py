@@ -87,6 +87,8 @@ _TURNS: dict[str, tuple[str, tuple[Turn, ...]]] = {
 _TURN_OF = {turn: name for name, (_, turns) in _TURNS.items() for turn in turns}
 _CONFLICTS = {"diverge": "#56b4e9", "merge": "#e69f00", "cross": "#d55e00"}  # in drawing order
 
+_Zones = dict[str, list[tuple[str, float, float]]]  # kind -> lane id, s_in, s_out (m)
+
 _POINT = 72.0  # points per inch
 
 
@@ -157,6 +159,23 @@ def _levels(shapes: Iterable[_Shape]) -> dict[str, int]:
     low, high = min(height.values()), max(height.values())
     storey = max(3.0, (high - low) / 12)  # m, below the clearance of any bridge for cars unless steep
     return {lane: int((z - low) / storey) for lane, z in height.items()}
+
+
+def _zones(network: Network) -> _Zones:
+    """The stretches that `conflicts.build_conflicts` finds, joined per lane and kind."""
+    from limsim_jax.maps.conflicts import ConflictType, build_conflicts
+    from limsim_jax.maps.lane_map import lane_rows
+
+    rows = lane_rows(network)
+    ids = list(rows)
+    table = build_conflicts(network, rows)
+    zones: _Zones = {}
+    for kind in _CONFLICTS:
+        zones[kind] = []
+        for k, found in enumerate(np.asarray(table.type) == ConflictType[kind.upper()]):
+            spans = zip(table.s_in[k][found].tolist(), table.s_out[k][found].tolist(), strict=True)
+            zones[kind].extend((ids[int(table.lane[k])], a, b) for a, b in _joined(spans))
+    return zones
 
 
 def _joined(spans: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -240,13 +259,13 @@ class _Painter:
         self.layers: dict[str, list[Artist]] = {}
         self.legend: dict[str, dict[str, Any]] = {}  # label -> style of its sample
 
-    def paint(self, *, conflicts: bool, labels: bool) -> None:
+    def paint(self, *, zones: _Zones | None, labels: bool) -> None:
         self.surfaces()
         self.marks()
         self.arrows()
-        self.connectors(faint=conflicts)
-        if conflicts:
-            self.conflicts()
+        self.connectors(faint=zones is not None)
+        if zones is not None:
+            self.conflicts(zones)
         self.crosswalks()
         self.stops()
         self.lights()
@@ -620,22 +639,15 @@ class _Painter:
                         text = f"{sign.value * 3.6:.0f}"
                         self.text("signs", sign.position[:2], text, top + 0.83, fontsize=0.5 * size)
 
-    def conflicts(self) -> None:
-        """Stretches where paths cross, merge or part (`conflicts.build_conflicts`), as bands along them."""
-        from limsim_jax.maps.conflicts import ConflictType, build_conflicts
-        from limsim_jax.maps.lane_map import lane_rows
-
-        rows = lane_rows(self.network)
-        ids = list(rows)
-        table = build_conflicts(self.network, rows)
+    def conflicts(self, zones: _Zones) -> None:
+        """Stretches where paths cross, merge or part, as bands along them."""
         top = max(self.levels.values(), default=0)
         for order, (kind, color) in enumerate(_CONFLICTS.items()):
-            bands: list[Array] = []
-            for k, found in enumerate(np.asarray(table.type) == ConflictType[kind.upper()]):
-                shape = self.shapes.get(ids[int(table.lane[k])])
-                if shape is not None:
-                    spans = zip(table.s_in[k][found].tolist(), table.s_out[k][found].tolist(), strict=True)
-                    bands.extend(shape.stretch(a, b, 0.5) for a, b in _joined(spans))
+            bands = [
+                shape.stretch(s_in, s_out, 0.5)
+                for lane, s_in, s_out in zones[kind]
+                if (shape := self.shapes.get(lane)) is not None
+            ]
             zorder = top + 0.57 + 0.01 * order
             self.areas("conflicts", bands, zorder, facecolors=color, alpha=0.6, linewidths=0)
             if bands:
@@ -714,7 +726,8 @@ def draw_network(
     """Draw a network on given axes: the base layer for maps, traffic and animations.
 
     Sets limits and an equal aspect. Sizes that stand for no length on the road (marks, arrows, lights)
-    fit the scale that the axes have now, so place and size the axes first.
+    fit the scale that the axes have now, so place and size the axes first. A camera that moves at that
+    scale only has to change the limits: without `bounds` the whole map is on the axes.
 
     Args:
         ax: axes to draw on; x and y are metres.
@@ -734,7 +747,7 @@ def draw_network(
     shapes, levels = _prepare(network)
     view = _view(network, shapes, bounds)
     painter = _Painter(ax, network, shapes, levels, view)
-    painter.paint(conflicts=conflicts, labels=labels)
+    painter.paint(zones=_zones(network) if conflicts else None, labels=labels)
     return painter.layers
 
 
@@ -877,7 +890,7 @@ def draw_map(
     detail = 0.0  # in, side of the windows below the map
     if size is None:
         used = rows * tall * scale + (rows - 1) * _GAP, columns * wide * scale + (columns - 1) * _GAP
-        room = (max(6.0, used[1]), max(2.8, used[0]))
+        room = (max(7.0, used[1]), max(2.8, used[0]))
         if bounds is None and scale < _CLEAR:
             count = max(2, round(room[0] / 2.8))
             detail = (room[0] - (count - 1) * _GAP) / count
@@ -890,13 +903,14 @@ def draw_map(
     figure = Figure(figsize=page, dpi=dpi, facecolor="white")
     cell = (room[0] - (columns - 1) * _GAP) / columns, (room[1] - (rows - 1) * _GAP) / rows
     legend: dict[str, dict[str, Any]] = {}
+    zones = _zones(network) if conflicts else None
 
     def panel(place: Bounds, box: Bounds, name: str) -> Axes:
         """Axes at x, y, width, height (inches) that show a box (m)."""
         x, y, width, height = place
         ax = figure.add_axes((x / page[0], y / page[1], width / page[0], height / page[1]))
         painter = _Painter(ax, network, shapes, levels, box, name)
-        painter.paint(conflicts=conflicts, labels=labels)
+        painter.paint(zones=zones, labels=labels)
         legend.update(painter.legend)
         ax.set_facecolor("#fbfbf9")
         ax.tick_params(labelsize=7, colors=INK, length=2.5)
@@ -950,7 +964,9 @@ def _details(network: Network, shapes: dict[str, _Shape], count: int, most: floa
             low, high = np.concatenate(inside).min(0), np.concatenate(inside).max(0)
             places.append((0.5 * (low + high), float(max(high - low)) + 16.0))
     lanes = [s for s in shapes.values() if s.lane.drivable and s.lane.junction is None]
-    for shape in sorted(lanes, key=lambda s: (-round(float(np.ptp(s.lane.width))), -s.lane.length)):
+    lanes.sort(key=lambda shape: -float(np.ptp(shape.lane.width)))
+    changing = [shape for shape in lanes if np.ptp(shape.lane.width) > 1.0]
+    for shape in changing or lanes[:1]:
         places.append((shape.at(0.5 * shape.lane.length, shape.centre), 80.0))
     windows: list[Bounds] = []
     for (x, y), side in places:
