@@ -299,6 +299,8 @@ class XmlFile:
             if len(parts) not in (2, 3):
                 raise self.error(element, f"{name}: '{item[:40]}' is not x,y or x,y,z")
             xyz = [self.parse_number(element, name, part) for part in parts]
+            if max(map(abs, xyz)) > 1e9:
+                raise self.error(element, f"{name}: '{item[:40]}' lies more than 1e9 m away")
             points.append(xyz if len(xyz) == 3 else [*xyz, 0.0])
         return np.array(points, float).reshape(-1, 3)
 
@@ -404,14 +406,11 @@ class Curve:
         angle = np.minimum((384 * SAMPLE_ERROR * np.maximum(kappa, 1e-12)) ** 0.25, 0.5)
         count = np.maximum(np.ceil(kappa * self.length / angle), 1).astype(int)
         end = np.cumsum(self.length)
-        start = np.concatenate([[0.0], end[:-1]])
-        jump = np.append(np.abs(np.diff(self.curvature)) > 1e-6, False)
-        parts = []
-        for s0, s1, n, before_jump in zip(start, end, count, jump, strict=True):
-            parts.append(np.linspace(s0, s1, n + 1)[:-1])
-            if before_jump and s1 - STEP > parts[-1][-1] + STEP / 2:
-                parts.append(np.array([s1 - STEP]))
-        s = np.append(np.concatenate(parts), end[-1])
+        step = self.length / count
+        arc = np.repeat(np.arange(len(count)), count)
+        nth = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        jump = np.append(np.abs(np.diff(self.curvature)) > 1e-6, False) & (step > 1.5 * STEP)
+        s = np.sort(np.concatenate([(end - self.length)[arc] + nth * step[arc], end[jump] - STEP]))
         hi = min(hi, float(end[-1]))
         return np.concatenate([[lo], s[(s > lo + STEP / 2) & (s < hi - STEP / 2)], [hi]])
 
@@ -485,7 +484,7 @@ def fit_polyline(
        the vertex is a corner: an arc rounds it off that leaves the vertex by `tolerance` or takes half
        of the shorter segment.
     4. Headings at the ends are those of the first and last segment. Where a heading (rad) is given and
-       differs from the segment by no more than 1.5 of the turn at the next vertex, the segment is the
+       differs from the segment by no more than the turn at the next vertex, the segment is the
        first chord of a bend and the given heading is taken.
 
     `points` are at least two, with no two equal in a row.
@@ -504,11 +503,22 @@ def fit_polyline(
         kept, spikes = np.delete(kept, folds[0] + 1), spikes + 1
 
     before, after = size[:-1], size[1:]
-    reach_in, reach_out = np.minimum(before, 2 * after), np.minimum(after, 2 * before)
-    turn_in = turn * reach_in / (reach_in + reach_out)
+    reach = np.stack([np.minimum(before, 2 * after), np.minimum(after, 2 * before)])  # of bends
+    turn_in = turn * reach[0] / reach.sum(0)
     turn_out = turn - turn_in
-    bulge = np.maximum(reach_in * np.abs(turn_in), reach_out * np.abs(turn_out)) / 4
-    bend = (np.abs(turn) <= MAX_BEND) & (bulge <= tolerance)
+    bend = np.abs(turn) <= MAX_BEND
+    while bend.any():
+        # Over each segment: the part that a bend takes, or all of it if there is one at either end.
+        at_start, at_end = np.where(bend, np.abs(turn_out), 0.0), np.where(bend, np.abs(turn_in), 0.0)
+        a, b = np.append(0.0, at_start), np.append(at_end, 0.0)
+        ra, rb = np.append(0.0, reach[1] * bend), np.append(reach[0] * bend, 0.0)
+        # Largest distance from its chord of an arc that meets it at angles a and b: that of the cubic.
+        whole = size * (0.148 * np.maximum(a, b) + 0.102 * np.minimum(a, b))
+        bulge = np.where(ra + rb < size, 0.148 * np.maximum(ra * a, rb * b), whole)
+        i = int(bulge.argmax())
+        if bulge[i] <= tolerance:
+            break
+        bend[i if i < len(turn) and b[i] >= a[i] else i - 1] = False
     with np.errstate(divide="ignore"):
         cut = np.minimum(np.minimum(before, after) / 2, tolerance / np.tan(np.abs(turn) / 4))
 
@@ -517,7 +527,7 @@ def fit_polyline(
     end = _end_heading(float(direction[-1]), end_heading, turn[-1:])
     nodes = [(vertices[0], start)]
     brackets = [(0, 0)]
-    reach = np.stack([np.where(bend, reach_in, cut), np.where(bend, reach_out, cut)])
+    reach = np.where(bend, reach, cut)
     taken = size[0] if start != direction[0] else 0.0  # of the segment, by the vertex behind
     for i, p in enumerate(vertices[1:-1]):
         h0, h1 = float(direction[i]), float(direction[i + 1])
@@ -526,14 +536,14 @@ def fit_polyline(
             nodes += [(p - cut[i] * u0, h0), (p + cut[i] * u1, h1)]
             brackets.append((len(nodes) - 2, len(nodes) - 1))
         else:
-            if taken + reach_in[i] < size[i] - RESOLUTION:
-                nodes.append((p - reach_in[i] * u0, h0))
+            if taken + reach[0, i] < size[i] - RESOLUTION:
+                nodes.append((p - reach[0, i] * u0, h0))
             nodes.append((p, h0 + float(turn_in[i])))
             brackets.append((len(nodes) - 1, len(nodes) - 1))
             last = i + 1 == len(turn)
             ahead = (size[-1] if end != direction[-1] else 0.0) if last else reach[0, i + 1]
-            if reach_out[i] + ahead < size[i + 1] - RESOLUTION:
-                nodes.append((p + reach_out[i] * u1, h1))
+            if reach[1, i] + ahead < size[i + 1] - RESOLUTION:
+                nodes.append((p + reach[1, i] * u1, h1))
         taken = reach[1, i]
     nodes.append((vertices[-1], end))
     brackets.append((len(nodes) - 1, len(nodes) - 1))
@@ -569,7 +579,7 @@ def _end_heading(segment: float, given: float | None, turn: Float[Array, " J"]) 
     """The given heading if the end segment can be a chord of a bend that has it, else the segment's."""
     if given is None or not len(turn):
         return segment
-    return given if abs(_wrap(given - segment)) <= 1.5 * abs(float(turn[0])) else segment
+    return given if abs(_wrap(given - segment)) <= abs(float(turn[0])) else segment
 
 
 def distance_to_polyline(xy: Float[Array, "M 2"], points: Float[Array, "K 2"]) -> Float[Array, " M"]:
@@ -1096,8 +1106,8 @@ class _Reader:
                     predecessors=tuple(back[lane.id]),
                     left=left.id if left else None,
                     right=right.id if right else None,
-                    may_change_left=self._may_change(lane, left),
-                    may_change_right=self._may_change(lane, right),
+                    may_change_left=self._may_change(lane, left, lane.change_left),
+                    may_change_right=self._may_change(lane, right, lane.change_right),
                     opposite=self._opposite(lane),
                     junction=edge.junction,
                 )
@@ -1149,17 +1159,16 @@ class _Reader:
         outer = lanes[lane.index - 1] if lane.index else None
         return (outer, inner) if self.left_hand else (inner, outer)
 
-    def _may_change(self, lane: _Lane, other: _Lane | None) -> bool:
+    def _may_change(self, lane: _Lane, other: _Lane | None, granted: frozenset[str]) -> bool:
+        """Whether ordinary motor vehicles may change to a neighbour; `granted`: whom `lane` lets do so."""
         if other is None:
             return False
-        # `changeLeft` speaks of the lane with the next higher index, whatever hand traffic keeps to.
-        granted = lane.change_left if other.index > lane.index else lane.change_right
-        common = lane.allowed & other.allowed
-        ordinary = (granted & common) - _SPECIAL_RIGHTS
-        if ordinary and common - granted - _SPECIAL_RIGHTS:
-            message = f"only {_short(sorted(ordinary))} may change to {other.id}; here all that use both may"
+        common = lane.allowed & other.allowed & ENGINE_CLASS.keys()
+        ordinary = common - _SPECIAL_RIGHTS
+        if granted & ordinary and ordinary - granted:
+            message = f"only {_short(sorted(granted & ordinary))} may change to {other.id}; here all may"
             self.report.approximated("lane", lane.id, message, lane.element.sourceline)
-        return bool(ordinary or (common and not common - _SPECIAL_RIGHTS and granted & common))
+        return bool(granted & (ordinary or common))  # lanes for those with special rights are theirs
 
     def _opposite(self, lane: _Lane) -> str | None:
         if lane.opposite is not None and lane.opposite not in self.lanes:
@@ -1258,8 +1267,6 @@ class _Reader:
         points = lane.points
         if not len(points):
             raise self.xml.error(lane.element, "the shape is empty")
-        if np.abs(points).max() > 1e9:
-            raise self.xml.error(lane.element, "the shape lies more than 1e9 m away")
         step = np.hypot(*np.diff(points[:, :2], axis=0).T)
         keep = np.append(True, step > 1e-6)
         if not keep.all():
@@ -1471,6 +1478,10 @@ class _Reader:
 
     def _crosswalks(self, lanes: dict[str, Lane]) -> tuple[Crosswalk, ...]:
         crosswalks = []
+        inside: dict[str | None, list[Lane]] = defaultdict(list)
+        for lane in lanes.values():
+            if self.edges[lane.road].function == "internal":
+                inside[lane.junction].append(lane)
         for edge in self.edges.values():
             if edge.function != "crossing":
                 continue
@@ -1480,9 +1491,9 @@ class _Reader:
                 side = np.stack([-np.sin(lane.heading), np.cos(lane.heading)], -1) * lane.width[:, None] / 2
                 outline = np.concatenate([lane.xyz[:, :2] + side, (lane.xyz[:, :2] - side)[::-1]])
             crossed = self.xml.text(edge.element, "crossingEdges", "").split()
-            inside = [x for x in lanes.values() if x.junction == edge.junction]
-            near = [x for x in inside if self.edges[x.road].function == "internal"]
-            near += [x for x in lanes.values() if x.road in crossed]
+            near = inside[edge.junction] + [
+                lanes[x.id] for road in crossed if road in self.edges for x in self.edges[road].lanes
+            ]
             spans = [(other.id, lo, hi) for other in near for lo, hi in _spans(other, outline)]
             crosswalks.append(
                 Crosswalk(id=edge.id, outline=outline, spans=tuple(spans), line=edge.element.sourceline)
@@ -1524,9 +1535,11 @@ def _spans(lane: Lane, outline: Float[Array, "K 2"]) -> list[tuple[float, float]
     i, j = np.nonzero(hit)
     cuts = np.concatenate([[0.0], np.sort(s[i] + u[i, j] * (s[i + 1] - s[i])), [lane.length]])
     middle = lane.pose((cuts[1:] + cuts[:-1]) / 2)[0][:, :2]
+    border = np.concatenate([outline, outline[:1]])
     spans: list[tuple[float, float]] = []
     for lo, hi, point in zip(cuts[:-1], cuts[1:], middle, strict=True):
-        if hi - lo > 1e-6 and _inside(point, outline):
+        grazing = distance_to_polyline(point[None], border)[0] < 0.05  # along the border, not across it
+        if hi - lo > 1e-6 and not grazing and _inside(point, outline):
             if spans and abs(spans[-1][1] - lo) < 1e-6:
                 lo = spans.pop()[0]
             spans.append((float(lo), float(hi)))
