@@ -99,39 +99,42 @@ class Geometry:
         c, s = math.cos(self.heading), math.sin(self.heading)
         return self.x + c * x - s * y, self.y + s * x + c * y, self.heading + turn, speed, turn_rate
 
-    def _parametric(self, u: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """A curve by cubics at these road coordinates.
+    @cached_property
+    def _curve(self) -> tuple[Array, Array, float, Any]:
+        """Cubics of a parametric record, its length per road coordinate, and the parameter along it.
 
         `s` is arc length (OpenDRIVE 1.8, 7.1), not the parameter: dp/ds = 1 / |r'(p)|. Where the curve of
         a paramPoly3 is longer or shorter than its record says, the difference is spread evenly.
         """
-        if self.shape.tag == "poly3":
-            x_, y_ = np.array([0.0, 1.0, 0.0, 0.0]), np.array([_number(self.shape, k) for k in "abcd"])
-            p_end = None
-        else:
-            x_, y_ = (np.array([_number(self.shape, k + axis) for k in "abcd"]) for axis in "UV")
-            p_end = self.length if self.shape.get("pRange") == "arcLength" else 1.0
-
-        def speed(p: Any) -> Any:
-            return np.hypot(_cubic(x_, p)[1], _cubic(y_, p)[1])
-
         stretch = 1.0
-        if p_end is not None:
-            total, _ = quad(speed, 0.0, p_end, epsabs=1e-12, epsrel=1e-12, limit=200)
+        if self.shape.tag == "poly3":
+            x, y = np.array([0.0, 1.0, 0.0, 0.0]), np.array([_number(self.shape, k) for k in "abcd"])
+        else:
+            x, y = (np.array([_number(self.shape, k + axis) for k in "abcd"]) for axis in "UV")
+            p_end = self.length if self.shape.get("pRange") == "arcLength" else 1.0
+            total, _ = quad(_speed, 0.0, p_end, (x, y), epsabs=1e-12, epsrel=1e-12, limit=200)
             stretch = total / self.length
         path = solve_ivp(
-            lambda _, p: stretch / speed(p),
-            (0.0, max(float(np.max(u, initial=0.0)), self.length)),
+            lambda _, p: stretch / _speed(p, x, y),
+            (0.0, self.length + 1.0),
             [0.0],
             rtol=1e-12,
             atol=1e-12,
             method="DOP853",
             dense_output=True,
         )
-        p = path.sol(u)[0] if len(u) else u
+        return x, y, stretch, path.sol
+
+    def _parametric(self, u: Array) -> tuple[Array, Array, Array, Array, Array]:
+        x_, y_, stretch, parameter = self._curve
+        p = parameter(u)[0] if len(u) else u
         (x, dx, ddx), (y, dy, ddy) = _cubic(x_, p), _cubic(y_, p)
-        turn_rate = (dx * ddy - dy * ddx) / speed(p) ** 3 * stretch
+        turn_rate = (dx * ddy - dy * ddx) / _speed(p, x_, y_) ** 3 * stretch
         return self._place(x, y, np.arctan2(dy, dx), np.full_like(u, stretch), turn_rate)
+
+
+def _speed(p: Any, x: Array, y: Array) -> Any:
+    return np.hypot(_cubic(x, p)[1], _cubic(y, p)[1])
 
 
 def _cubic(c: Array, p: Any) -> tuple[Any, Any, Any]:

@@ -6,6 +6,7 @@ continuous whatever is drawn.
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections.abc import Sequence
@@ -66,14 +67,16 @@ def profile(
 ) -> list[Element]:
     """Continuous cubic records over `[base, base + length]` with values about `low` to `high`."""
     breaks = sorted({0.0, *(k / 10 for k in draw(st.sets(st.integers(1, 9), max_size=2)))})
-    values = [draw(number(low, high)) for _ in range(len(breaks) + 1)]
-    records = []
-    for i, at in enumerate(breaks):
-        span = ([*breaks, 1.0][i + 1] - at) * length
-        steep = min(0.04, 0.3 * (high - low) / span)
-        slopes = draw(number(-steep, steep)), draw(number(-steep, steep))
-        coefficients = cubic(values[i], slopes[0], values[i + 1], slopes[1], span)
-        records.append(node(tag, **{start: base + at * length}, **coefficients))
+    value, records = draw(number(low, high)), []
+    for at, following in itertools.pairwise([*breaks, 1.0]):
+        span = (following - at) * length
+        reach = min(high - low, 0.15 * span)  # no steeper than lanes are built
+        after = min(max(value + draw(number(-1, 1)) * reach, low), high)
+        slopes = draw(number(-0.04, 0.04)), draw(number(-0.04, 0.04))
+        records.append(
+            node(tag, **{start: base + at * length}, **cubic(value, slopes[0], after, slopes[1], span))
+        )
+        value = after
     return records
 
 
