@@ -264,6 +264,20 @@ def test_opposite_directions_are_parted_by_one_centre_line(crossing):
     assert sum(len(lines) for color, lines in _lines(marks) if color == draw.CENTRE) == 4
 
 
+def test_a_sidewalk_does_not_hide_the_edge_of_the_carriageway(crossing):
+    walk, out = crossing.lanes["E_walk"], crossing.lanes["E_out"]
+    beside = {"E_walk": replace(walk, left="E_out"), "E_out": replace(out, right="E_walk")}
+    rest = {id_: lane for id_, lane in crossing.lanes.items() if id_ not in beside}
+    marks = draw_network(_axes(), replace(crossing, lanes={**beside, **rest}))["marks"]
+    shared = [
+        color
+        for color, lines in _lines(marks)
+        for line in lines
+        if np.allclose(line[:, 1], -3.5) and line[:, 0].min() >= BOX
+    ]
+    assert shared == [draw.EDGE]
+
+
 def test_connectors_have_the_colour_of_their_turn(crossing):
     artists = draw_network(_axes(), crossing)["connectors"]
     counts = {color: len(lines) for color, lines in _lines(artists)}
@@ -412,12 +426,16 @@ def test_a_long_thin_map_is_cut_into_strips_of_one_scale(crossing, heading, gain
 
 
 def test_details_show_junctions_that_are_small_on_the_page(crossing):
-    far = _line("far_1", (2000.0, 1500.0), (0.0, 1500.0))
-    figure = draw_map(replace(crossing, lanes={**crossing.lanes, "far_1": far}))
+    lanes = {
+        id_: replace(lane, xyz=3 * lane.xyz, s=3 * lane.s, road_s=3 * lane.road_s)
+        for id_, lane in crossing.lanes.items()
+    }
+    lanes["far_1"] = _line("far_1", (2000.0, 1500.0), (0.0, 1500.0))
+    figure = draw_map(replace(crossing, lanes=lanes))
     (overview,) = (ax for ax in figure.axes if not ax.get_title(loc="left"))
     details = {ax.get_title(loc="left"): ax for ax in figure.axes if ax is not overview}
     assert _scale(details["A"])[0] > 3 * _scale(overview)[0]
-    for reach in (-BOX, BOX):  # the whole junction
+    for reach in (-3 * BOX, 3 * BOX):  # the whole junction
         assert details["A"].get_xlim()[0] < reach < details["A"].get_xlim()[1]
         assert details["A"].get_ylim()[0] < reach < details["A"].get_ylim()[1]
     assert set(details) <= {text.get_text() for text in overview.texts}  # each is framed on the map
