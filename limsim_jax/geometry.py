@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
-
-from limsim_jax.numerics import safe_norm
+from numpy.typing import NDArray
 
 Box = Float[Array, "5"]
 """x, y of the centre (m), heading (rad), length, width (m)."""
@@ -28,15 +28,15 @@ def direction(dx: Float[Array, "*b"], dy: Float[Array, "*b"]) -> Float[Array, "*
     return jnp.where(zero, 0, jnp.arctan2(dy, jnp.where(zero, 1, dx)))
 
 
-def polynomial(coefficients: Sequence[Float[Array, "*b"]], u: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """c[0] + c[1] u + c[2] u**2 + ... by Horner's rule."""
+def polynomial(coefficients: Sequence[Any] | NDArray[Any], u: Any) -> Any:
+    """c[0] + c[1] u + c[2] u**2 + ... by Horner's rule; NumPy or JAX, as the input."""
     value = coefficients[-1]
     for coefficient in reversed(coefficients[:-1]):
         value = value * u + coefficient
     return value
 
 
-def derivative(coefficients: Sequence[Float[Array, "*b"]]) -> list[Float[Array, "*b"]]:
+def derivative(coefficients: Sequence[Any] | NDArray[Any]) -> list[Any]:
     """Coefficients of the derivative of the polynomial with these coefficients (two or more)."""
     return [power * coefficient for power, coefficient in enumerate(coefficients)][1:]
 
@@ -77,10 +77,3 @@ def box_separation(a: Box, b: Box) -> Float[Array, ""]:
 def boxes_overlap(a: Box, b: Box) -> Bool[Array, ""]:
     """Whether two boxes share a point; touching counts."""
     return box_separation(a, b) <= 0
-
-
-def distance(
-    x0: Float[Array, "*b"], y0: Float[Array, "*b"], x1: Float[Array, "*b"], y1: Float[Array, "*b"]
-) -> Float[Array, "*b"]:
-    """Distance of two points, m; zero gradient where they coincide."""
-    return safe_norm(jnp.stack([x1 - x0, y1 - y0]), axis=0)

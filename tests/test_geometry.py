@@ -123,9 +123,3 @@ def test_box_separation_gradient_is_finite_and_right():
             np.testing.assert_allclose(grad[i], central, atol=1e-7)
     same = jnp.array([1.0, 2.0, 0.3, 4.0, 2.0])
     assert np.isfinite(jax.grad(geometry.box_separation)(same, same)).all()
-
-
-def test_distance_has_zero_gradient_where_the_points_coincide():
-    np.testing.assert_allclose(geometry.distance(*(jnp.float32(v) for v in (1, 2, 4, 6))), 5.0)
-    grad = jax.grad(geometry.distance, argnums=(0, 1))(1.0, 2.0, 1.0, 2.0)
-    assert grad == (0, 0)

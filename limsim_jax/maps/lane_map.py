@@ -21,10 +21,11 @@ gathers; a local projection reads four rows and is bound by the dependent gather
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -33,11 +34,18 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
 from limsim_jax.geometry import derivative, direction, polynomial, wrap_angle
+from limsim_jax.maps.conflicts import ConflictTable, build_conflicts
 from limsim_jax.maps.network import ImportReport, Lane, LaneType, MapError, Network
+from limsim_jax.maps.routing import RouteTable, build_routes
+from limsim_jax.maps.signals import SignalTable, build_signals
 from limsim_jax.numerics import safe_divide, safe_sqrt
 
 NO_LANE = -1
 """Row of the null lane."""
+
+Index = Int[Array, "*b"] | Int[np.ndarray, "*b"] | int
+Number = Float[Array, "*b"] | Float[np.ndarray, "*b"] | float
+Goals = Sequence[Sequence[str]] | Mapping[str, Sequence[str]]
 
 VEHICLE_CLASSES = ("car", "van", "truck", "bus", "motorcycle", "emergency")
 """Vehicle classes in the order of the bits of `LaneMap.access`."""
@@ -48,7 +56,7 @@ LANE_TYPES = tuple(LaneType)
 SPACINGS = tuple(2.0**power for power in range(4, -4, -1))
 """Interval lengths to choose from, longest first, m."""
 
-TOLERANCE = {"position": 1e-3, "width": 1e-3, "elevation": 1e-2, "heading": math.radians(0.1)}
+TOLERANCE = {"position": 1e-3, "width": 1e-3, "elevation": 1e-2, "heading": math.radians(0.25)}
 """Largest deviation of a device lane from its host lane, m and rad, unless `ds` is already the least."""
 
 WORST_DEVIATION = 0.05
@@ -60,14 +68,30 @@ REACH = 10.0
 TURN_WINDOW = 4.0
 """`curvature_max` is the mean over a stretch of this length, m: about a wheelbase and a half."""
 
-_CELL = 16.0  # m, side of the cells that `project` looks up
-_CHUNK_LENGTH, _CHUNK_TURN = 32.0, 0.3  # m, rad: a candidate of `project` has at most about one closest point
+_CELL = 8.0  # m, side of the cells that `project` looks up
+_CHUNK_LENGTH, _CHUNK_TURN = 32.0, 0.6  # m, rad: a candidate of `project` has at most about one closest point
 _JUMP = 1.5e-3  # m: closer host samples are a kink or a step
 _JUMP_ZONE = 0.5  # m: around a kink or a step, heading and width are not judged
-_LOCAL_STEPS = 3  # Newton steps of `to_frenet` before the differentiable one
-_GLOBAL_STEPS = 8  # Newton or bisection steps per candidate of `project`
+_LOCAL_STEPS = 4  # Newton steps of `to_frenet` before the differentiable one
+_GLOBAL_STEPS = 4  # Newton or bisection steps per candidate of `project`
 _MIN_SLOPE = 0.1  # least 1 - kappa d that a Newton step divides by
+_CURVATURE_SLIP = 1e-3  # rad: curvature and turn between two host samples that differ by more show a jump
 _MAX_ROWS = 2**24
+_LEAST = {  # least sizes of tables, so that all small maps have the same shapes
+    "lanes": 64,
+    "rows": 4096,
+    "neighbors": 4,
+    "chunks": 256,
+    "cells": 1024,
+    "candidates": 8192,
+    "connectors": 64,
+    "foes": 16,
+    "goals": 16,
+    "programs": 16,
+    "phases": 16,
+    "links": 32,
+    "movements": 64,
+}
 
 
 @struct.dataclass(frozen=True, kw_only=True)
@@ -98,19 +122,19 @@ class LaneMap:
     junction: Int[Array, " L"]  # index into the network's junctions, else -1
     valid: Bool[Array, " L"]  # False for the null lane and padding
     chunk_lane: Int[Array, " C"]  # short stretches of lane: what `project` compares
-    chunk_span: Float[Array, "C 2"]  # m, first and last s
+    chunk: Float[Array, "C 6"]  # m, first and last s; x, y of the first and of the last
     cell_start: Int[Array, " H1"]  # hashed cell h holds cell_chunks[cell_start[h] : cell_start[h + 1]]
     cell_chunks: Int[Array, " Q"]
-    conflicts: Any = None  # ConflictTable
-    routes: Any = None  # RouteTable
-    signals: Any = None  # SignalTable
+    conflicts: ConflictTable
+    routes: RouteTable
+    signals: SignalTable
 
 
 # --- look-ups ----------------------------------------------------------------------------------------
 
 
 def pose(
-    lane_map: LaneMap, lane: Int[Array, "*b"], s: Float[Array, "*b"], d: Float[Array, "*b"] | float = 0.0
+    lane_map: LaneMap, lane: Index, s: Number, d: Number = 0.0
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
     """Position x, y (m) at arc length `s` and lateral offset `d` (m, left > 0), and the lane's heading (rad).
 
@@ -123,22 +147,20 @@ def pose(
     return curve.x0 + (curve.x - d * ty), curve.y0 + (curve.y + d * tx), direction(curve.dx, curve.dy)
 
 
-def curvature(lane_map: LaneMap, lane: Int[Array, "*b"], s: Float[Array, "*b"]) -> Float[Array, "*b"]:
+def curvature(lane_map: LaneMap, lane: Index, s: Number) -> Float[Array, "*b"]:
     """Curvature of the centre line, 1/m, positive where it bends left; beyond the ends that of the end."""
     row, u = _locate(lane_map, lane, _as_float(lane_map, s))
     u = _inside(lane_map, row, u)
     return polynomial(_columns(lane_map.rows, row, range(12, 14)), u)
 
 
-def width(lane_map: LaneMap, lane: Int[Array, "*b"], s: Float[Array, "*b"]) -> Float[Array, "*b"]:
+def width(lane_map: LaneMap, lane: Index, s: Number) -> Float[Array, "*b"]:
     """Lane width, m; beyond the ends that of the end."""
     row, u = _locate(lane_map, lane, _as_float(lane_map, s))
     return polynomial(_columns(lane_map.rows, row, range(8, 12)), _inside(lane_map, row, u))
 
 
-def elevation(
-    lane_map: LaneMap, lane: Int[Array, "*b"], s: Float[Array, "*b"]
-) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+def elevation(lane_map: LaneMap, lane: Index, s: Number) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """Elevation z (m) and grade dz/ds of the centre line; beyond the ends those of the end."""
     row, u = _locate(lane_map, lane, _as_float(lane_map, s))
     u = _inside(lane_map, row, u)
@@ -146,9 +168,7 @@ def elevation(
     return polynomial(cubic, u), polynomial(derivative(cubic), u)
 
 
-def neighbor(
-    lane_map: LaneMap, lane: Int[Array, "*b"], side: Int[Array, "*b"] | int
-) -> tuple[Int[Array, "*b"], Bool[Array, "*b"]]:
+def neighbor(lane_map: LaneMap, lane: Index, side: Index) -> tuple[Int[Array, "*b"], Bool[Array, "*b"]]:
     """Lane on the left (`side` > 0) or right in the same direction, else NO_LANE; whether one may change."""
     left = jnp.asarray(side) > 0
     return (
@@ -157,9 +177,7 @@ def neighbor(
     )
 
 
-def side_s(
-    lane_map: LaneMap, lane: Int[Array, "*b"], s: Float[Array, "*b"], side: Int[Array, "*b"] | int
-) -> Float[Array, "*b"]:
+def side_s(lane_map: LaneMap, lane: Index, s: Number, side: Index) -> Float[Array, "*b"]:
     """Arc length (m) on the left (`side` > 0) or right neighbour, level with `s` on `lane`.
 
     Where there is no neighbour, `s` itself.
@@ -170,9 +188,7 @@ def side_s(
     return jnp.where(left, start_l, start_r) + u * jnp.where(left, slope_l, slope_r)
 
 
-def turn_speed(
-    lane_map: LaneMap, lane: Int[Array, "*b"], lateral_acceleration: Float[Array, "*b"] | float
-) -> Float[Array, "*b"]:
+def turn_speed(lane_map: LaneMap, lane: Index, lateral_acceleration: Number) -> Float[Array, "*b"]:
     """Speed (m/s) at which the tightest bend takes this lateral acceleration (m/s^2), at most the limit.
 
     SUMO limits junctions by 5.5 m/s^2; comfortable driving stays within 2 to 3 m/s^2.
@@ -185,10 +201,10 @@ def turn_speed(
 
 def to_frenet(
     lane_map: LaneMap,
-    lane: Int[Array, "*b"],
-    s_guess: Float[Array, "*b"],
-    x: Float[Array, "*b"],
-    y: Float[Array, "*b"],
+    lane: Index,
+    s_guess: Number,
+    x: Number,
+    y: Number,
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
     """Arc length `s`, lateral offset `d` (m, left > 0) of a point, and the lane's heading there (rad).
 
@@ -215,16 +231,19 @@ def to_frenet(
 
 def project(
     lane_map: LaneMap,
-    x: Float[Array, "*b"],
-    y: Float[Array, "*b"],
-    heading: Float[Array, "*b"] | None = None,
+    x: Number,
+    y: Number,
+    heading: Number | None = None,
     max_heading: float = math.pi / 2,
 ) -> tuple[Int[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
     """Nearest lane of a point, and `s`, `d` (m) and the lane's heading (rad) there.
 
-    Compares the distance to the centre lines of all lanes within `REACH`, or with `heading` of those
-    whose direction differs by less than `max_heading`; equal distances go to the lower row. NO_LANE
-    where there is none. For the start of a run: `to_frenet` is an order of magnitude faster.
+    Compares the feet of all perpendiculars on centre lines, and the ends of lanes, within `REACH`; with
+    `heading`, those where the lane's heading differs by less than `max_heading`. Of equal distances the
+    lower row wins. NO_LANE where there is none. A point beyond the centre of a bend sees two ends of it
+    and no foot between; with `heading`, only the nearer end is compared.
+
+    Meant for the start of a run: `to_frenet` is some fifty times faster.
     """
     x, y = _as_float(lane_map, x), _as_float(lane_map, y)
     frozen, px, py = lax.stop_gradient((lane_map, x, y))
@@ -235,8 +254,13 @@ def project(
         k, best, best_lane, best_s = carry
         chunk = frozen.cell_chunks[start + jnp.minimum(k, count - 1)]
         lane = frozen.chunk_lane[chunk]
-        low, high = frozen.chunk_span[chunk, 0], frozen.chunk_span[chunk, 1]
-        s = _search(frozen, lane, (low + high) / 2, low, high, px, py, _GLOBAL_STEPS)
+        low, high, x0, y0, x1, y1 = _columns(frozen.chunk, chunk, range(6))
+        # Downhill from the nearer end: inside a bend the distance has its maximum between two ends.
+        s = jnp.where(jnp.hypot(px - x0, py - y0) <= jnp.hypot(px - x1, py - y1), low, high)
+        s = _search(frozen, lane, s, low, high, px, py, _GLOBAL_STEPS)
+        # An end of the stretch is no foot: go on to the foot, whose heading it is that has to fit.
+        s = _search(frozen, lane, s, -jnp.inf, jnp.inf, px, py, _GLOBAL_STEPS)
+        s = jnp.clip(s, 0, frozen.length[lane])
         foot = _curve(frozen, *_locate(frozen, lane, s))
         gap = jnp.hypot((px - foot.x0) - foot.x, (py - foot.y0) - foot.y)
         better = (k < count) & (gap < best)
@@ -262,11 +286,10 @@ def absolute(lane_map: LaneMap, x: Any, y: Any) -> tuple[NDArray[np.float64], ND
     return np.asarray(x, np.float64) + x0, np.asarray(y, np.float64) + y0
 
 
-def relative(lane_map: LaneMap, x: Any, y: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def relative(lane_map: LaneMap, x: Any, y: Any) -> tuple[Any, Any]:
     """File coordinates (m) in the coordinates of the map, on the host: the inverse of `absolute`."""
     x0, y0 = np.asarray(lane_map.origin, np.float64)
-    dtype = lane_map.rows.dtype
-    return (np.asarray(x, np.float64) - x0).astype(dtype), (np.asarray(y, np.float64) - y0).astype(dtype)
+    return np.float32(np.asarray(x, np.float64) - x0), np.float32(np.asarray(y, np.float64) - y0)
 
 
 def _as_float(lane_map: LaneMap, value: Any) -> Float[Array, "*b"]:
@@ -279,7 +302,7 @@ def _columns(table: Float[Array, "S W"], row: Int[Array, "*b"], columns: Iterabl
 
 
 def _locate(
-    lane_map: LaneMap, lane: Int[Array, "*b"], s: Float[Array, "*b"]
+    lane_map: LaneMap, lane: Index, s: Float[Array, "*b"]
 ) -> tuple[Int[Array, "*b"], Float[Array, "*b"]]:
     """Row of the interval that holds `s`, and arc length from its start, m."""
     ds = lane_map.ds[lane]
@@ -327,7 +350,7 @@ def _unit(dx: Float[Array, "*b"], dy: Float[Array, "*b"]) -> tuple[Float[Array, 
     return safe_divide(dx, norm), safe_divide(dy, norm)
 
 
-def _newton_step(curve: _Curve, x: Float[Array, "*b"], y: Float[Array, "*b"]) -> Float[Array, "*b"]:
+def _newton_step(curve: _Curve, x: Number, y: Number) -> Float[Array, "*b"]:
     """Newton step (m) towards the s whose normal passes through the point."""
     ex, ey = (x - curve.x0) - curve.x, (y - curve.y0) - curve.y
     ahead = ex * curve.dx + ey * curve.dy
@@ -337,12 +360,12 @@ def _newton_step(curve: _Curve, x: Float[Array, "*b"], y: Float[Array, "*b"]) ->
 
 def _search(
     lane_map: LaneMap,
-    lane: Int[Array, "*b"],
+    lane: Index,
     s: Float[Array, "*b"],
-    low: Float[Array, "*b"] | float,
-    high: Float[Array, "*b"] | float,
-    x: Float[Array, "*b"],
-    y: Float[Array, "*b"],
+    low: Number,
+    high: Number,
+    x: Number,
+    y: Number,
     steps: int,
 ) -> Float[Array, "*b"]:
     """Newton steps for the foot of the perpendicular within [low, high].
@@ -381,20 +404,22 @@ def lane_ids(network: Network) -> list[str]:
     return [lane.id for lane in network.drivable_lanes()]
 
 
-def bucket(count: int) -> int:
-    """Least of 1, 2, 3, 4, 6, 8, 12, 16, 24, ... that is not below `count`."""
-    power = 1 << max(count - 1, 0).bit_length()
+def bucket(count: int, least: int = 1) -> int:
+    """Least of 1, 2, 3, 4, 6, 8, 12, 16, 24, ... that is below neither `count` nor `least`."""
+    count = max(count, least)
+    power = 1 << (count - 1).bit_length()
     return 3 * power // 4 if power >= 4 and count <= 3 * power // 4 else power
 
 
 def build_lane_map(
-    network: Network, goals: Sequence[str] | None = None, *, report: ImportReport | None = None
+    network: Network, goals: Goals | None = None, *, report: ImportReport | None = None
 ) -> LaneMap:
     """Rasterise the lanes of a network for the device, with its conflict, routing and signal tables.
 
     Args:
         network: the map.
-        goals: ids of the lanes to which `routes` leads; default: see `routing.build_routes`.
+        goals: lane ids of each goal of `routes`, in the order of its columns or by name; default: the
+            ways out of the map, see `routing.default_goals`.
         report: takes a note for every lane that misses `TOLERANCE` at the least interval length.
 
     Raises:
@@ -413,12 +438,23 @@ def build_lane_map(
     if len(raster.lane) >= _MAX_ROWS:
         raise MapError(f"{len(raster.lane)} intervals; at most {_MAX_ROWS} fit", file=network.source)
 
-    num_rows, num_lanes = bucket(len(raster.lane) + 1), bucket(len(lanes) + 1)
+    num_rows, num_lanes = (
+        bucket(len(raster.lane) + 1, _LEAST["rows"]),
+        bucket(len(lanes) + 1, _LEAST["lanes"]),
+    )
     rows = raster.rows.copy()
     rows[:, [0, 4]] -= origin
     straight = np.zeros(16)
     straight[[1, 8, 14]] = 1.0  # along x, 1 m wide, 1 m long
-    inert = {"first": num_rows - 1, "count": 1, "ds": 1.0, "length": 1.0, "speed_limit": 1.0, "stop_s": 1.0}
+    inert = {
+        "first": num_rows - 1,
+        "access": 0,
+        "count": 1,
+        "ds": 1.0,
+        "length": 1.0,
+        "speed_limit": 1.0,
+        "stop_s": 1.0,
+    }
     tables |= {
         "first": raster.first,
         "count": raster.count,
@@ -434,7 +470,41 @@ def build_lane_map(
         **{name: _pad(table, num_lanes, inert.get(name, _inert(table))) for name, table in tables.items()},
         **_grid(raster, rows),
     }
-    return LaneMap(**{name: jnp.asarray(_device_type(array)) for name, array in arrays.items()})
+    lane_map = LaneMap(**arrays, **_rule_tables(network, goals, num_lanes))
+    return jax.tree.map(lambda array: jnp.asarray(_device_type(array)), lane_map)
+
+
+def _rule_tables(network: Network, goals: Goals | None, num_lanes: int) -> dict[str, Any]:
+    """Conflicts, routes and signals, padded to buckets."""
+    rows = lane_rows(network)
+    conflicts = build_conflicts(network, rows)
+    routes = build_routes(network, rows, goals)
+    signals = build_signals(network, rows)
+    (connectors, foes), (_, num_goals) = conflicts.foe.shape, routes.distance.shape
+    programs, phases, links = signals.state.shape
+    size = {
+        name: bucket(count, _LEAST[name])
+        for name, count in {
+            "connectors": connectors,
+            "foes": foes,
+            "goals": num_goals,
+            "programs": programs,
+            "phases": phases,
+            "links": links,
+            "movements": len(signals.movement_link),
+        }.items()
+    }
+    return {
+        "conflicts": conflicts.pad(lanes=num_lanes, connectors=size["connectors"], foes=size["foes"]),
+        "routes": routes.pad(lanes=num_lanes, goals=size["goals"]),
+        "signals": signals.pad(
+            programs=size["programs"],
+            phases=size["phases"],
+            links=size["links"],
+            lanes=num_lanes,
+            movements=size["movements"],
+        ),
+    }
 
 
 def _device_type(array: NDArray[Any]) -> NDArray[Any]:
@@ -479,7 +549,7 @@ def _lane_tables(network: Network, lanes: list[Lane]) -> dict[str, NDArray[Any]]
         found = [
             [r for other in getattr(lane, which) if (r := row_of(lane, other)) != NO_LANE] for lane in lanes
         ]
-        table = np.full((len(lanes), max(4, bucket(max(map(len, found))))), NO_LANE)
+        table = np.full((len(lanes), bucket(max(map(len, found)), _LEAST["neighbors"])), NO_LANE)
         for row, others in enumerate(found):
             table[row, : len(others)] = others
         return table
@@ -515,10 +585,11 @@ class _HostLanes:
     length: Float[NDArray[np.float64], " L"]
     first: Int[NDArray[np.int64], " L"]  # its first sample
     lane: Int[NDArray[np.int64], " M"]  # lane of each sample
-    t: Float[NDArray[np.float64], " M"]  # samples on the axis, strictly rising
+    s: Float[NDArray[np.float64], " M"]
+    t: Float[NDArray[np.float64], " M"]  # the same on the axis
     xyz: Float[NDArray[np.float64], "M 3"]
     heading: Float[NDArray[np.float64], " M"]
-    curvature: Float[NDArray[np.float64], " M"]
+    curvature: Float[NDArray[np.float64], "M 2"]  # where the stretch to the next sample starts and ends
     width: Float[NDArray[np.float64], " M"]
     side_s: Float[NDArray[np.float64], "M 2"]  # s on the left and on the right lane
 
@@ -539,6 +610,9 @@ class _HostLanes:
         length = np.array([lane.length for lane in lanes])
         offset = np.concatenate([[0.0], np.cumsum(length + 1.0)[:-1]])
         counts = np.array([len(lane.s) for lane in lanes])
+        s, heading, curvature = (
+            np.concatenate([getattr(lane, name) for lane in lanes]) for name in ("s", "heading", "curvature")
+        )
         side_s = [
             network.lanes[other].s_at_road(lane.road_s) if other in network.lanes else lane.s
             for lane in lanes
@@ -550,10 +624,11 @@ class _HostLanes:
             length=length,
             first=np.cumsum(counts) - counts,
             lane=np.repeat(np.arange(len(lanes)), counts),
-            t=np.concatenate([lane.s for lane in lanes]) + np.repeat(offset, counts),
+            s=s,
+            t=s + np.repeat(offset, counts),
             xyz=np.concatenate([lane.xyz for lane in lanes]),
-            heading=np.concatenate([lane.heading for lane in lanes]),
-            curvature=np.concatenate([lane.curvature for lane in lanes]),
+            heading=heading,
+            curvature=_one_sided_curvature(s, heading, curvature),
             width=np.concatenate([lane.width for lane in lanes]),
             side_s=np.stack([np.concatenate(side_s[0::2]), np.concatenate(side_s[1::2])], -1),
         )
@@ -563,8 +638,8 @@ class _HostLanes:
         t = self.offset[lane] + s
         last = np.append(self.first[1:], len(self.t))[lane] - 2
         j = np.clip(np.searchsorted(self.t, t + 1e-7 * toward, side="right") - 1, self.first[lane], last)
-        h = self.t[j + 1] - self.t[j]
-        w = np.clip((t - self.t[j]) / h, 0.0, 1.0)
+        h = self.s[j + 1] - self.s[j]
+        w = np.clip((s - self.s[j]) / h, 0.0, 1.0)
 
         def linear(values: NDArray[np.float64], w: NDArray[np.float64]) -> NDArray[np.float64]:
             w = w.reshape(w.shape + (1,) * (values.ndim - 1))
@@ -590,10 +665,30 @@ class _HostLanes:
             xy=xy,
             z=linear(self.xyz[:, 2], w),
             heading=heading,
-            curvature=linear(self.curvature, one_sided),
+            curvature=self.curvature[j, 0] * (1 - one_sided) + self.curvature[j, 1] * one_sided,
             width=linear(self.width, one_sided),
             side_s=linear(self.side_s, w),
         )
+
+
+def _one_sided_curvature(
+    s: NDArray[np.float64], heading: NDArray[np.float64], curvature: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Curvature where the stretch from each sample to the next starts and ends.
+
+    A sample where the curvature jumps has one value, right for one of its sides. The turn along the stretch
+    tells when that is the other side; then the value that is nearer to the mean curvature holds, and the
+    other follows from the mean.
+    """
+    pairs = np.stack([curvature, np.append(curvature[1:], curvature[-1])], -1)
+    h = np.append(np.diff(s), 0.0)
+    sound = h > _JUMP  # not a kink, nor the gap between two lanes
+    mean = np.divide(np.append(np.diff(heading), 0.0), h, out=pairs.mean(1), where=sound)
+    wrong = np.abs(pairs.mean(1) - mean) * h > _CURVATURE_SLIP
+    start_holds = np.abs(pairs[:, 0] - mean) < np.abs(pairs[:, 1] - mean)
+    pairs[:, 1] = np.where(wrong & start_holds, 2 * mean - pairs[:, 0], pairs[:, 1])
+    pairs[:, 0] = np.where(wrong & ~start_holds, 2 * mean - pairs[:, 1], pairs[:, 0])
+    return pairs
 
 
 class _Samples(NamedTuple):
@@ -624,6 +719,7 @@ def _rasterise(network: Network, host: _HostLanes, report: ImportReport | None) 
     check = _check_points(host)
     everything = todo = np.arange(len(host.lanes))
     ds = np.full(len(host.lanes), SPACINGS[-1])
+    errors: dict[str, NDArray[np.float64]] = {}
     for spacing in SPACINGS:
         errors = _deviation(host, todo, _cut(host, todo, np.full(len(todo), spacing)), check)
         missed = np.any([errors[name] > limit for name, limit in TOLERANCE.items()], axis=0)
@@ -636,7 +732,7 @@ def _rasterise(network: Network, host: _HostLanes, report: ImportReport | None) 
             error = {name: values[k] for name, values in errors.items() if values[k] > TOLERANCE[name]}
             if error.get("position", 0.0) > WORST_DEVIATION:
                 raise MapError(
-                    f"intervals of {spacing:g} m leave the centre line by {error['position']:.3f} m",
+                    f"intervals of {SPACINGS[-1]:g} m leave the centre line by {error['position']:.3f} m",
                     file=network.source,
                     element=f"lane '{host.lanes[lane].id}'",
                 )
@@ -645,7 +741,7 @@ def _rasterise(network: Network, host: _HostLanes, report: ImportReport | None) 
                 report.approximated(
                     "device lane",
                     host.lanes[lane].id,
-                    f"deviates at {spacing:g} m intervals (m, rad): {deviation}",
+                    f"deviates at {SPACINGS[-1]:g} m intervals (m, rad): {deviation}",
                 )
     return _cut(host, everything, ds)
 
@@ -692,10 +788,13 @@ class _Check(NamedTuple):
 
 
 def _check_points(host: _HostLanes) -> _Check:
-    """Host samples, places between them at most 0.25 m apart, and more around kinks and steps."""
+    """Host samples, places between them at most 0.25 m apart, and more around kinks and steps.
+
+    The number of parts is odd: halves and quarters of host intervals tend to be bounds of ours.
+    """
     gap = np.diff(host.t)
     same = host.lane[1:] == host.lane[:-1]
-    parts = np.where(same, 2 * np.maximum(1, np.ceil(gap / 0.5).astype(np.int64)), 1)
+    parts = np.where(same, 2 * np.ceil(gap / 0.5).astype(np.int64) + 1, 1)
     segment = np.repeat(np.arange(len(gap)), parts)
     part = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
     t = np.append(host.t[segment] + gap[segment] * part / parts[segment], host.t[-1])
@@ -772,7 +871,9 @@ def _grid(raster: _Raster, rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]
     head = np.flatnonzero(np.append(True, (np.diff(key) != 0).any(0)))  # first interval of each chunk
     tail = np.append(head[1:], len(h)) - 1
     chunk_lane = raster.lane[head]
+    ends = np.stack([polynomial(c[:4, tail], h[tail]), polynomial(c[4:8, tail], h[tail])], -1)
     span = np.stack([raster.start[head], raster.start[tail] + h[tail]], -1)
+    chunks = np.concatenate([span, rows[head][:, [0, 4]], ends], -1)
 
     # Points at most 2 m apart along each interval: no point of it is more than 1 m from one of them.
     parts = np.maximum(1, np.ceil(h / 2.0).astype(np.int64))
@@ -783,18 +884,19 @@ def _grid(raster: _Raster, rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]
     chunk = (np.searchsorted(head, np.arange(len(h)), side="right") - 1)[row]
     found = []
     base = np.floor(xy / _CELL)
-    for step in np.ndindex(3, 3):
-        cell = base + step - 1
+    around = math.ceil((REACH + 1.01) / _CELL)
+    for step in np.ndindex(2 * around + 1, 2 * around + 1):
+        cell = base + step - around
         outside = np.maximum(np.maximum(cell * _CELL - xy, xy - (cell + 1) * _CELL), 0.0)
         near = np.hypot(*outside.T) <= REACH + 1.01
         found.append(np.column_stack([cell[near].astype(np.int64), chunk[near]]))
     entries = np.unique(np.concatenate(found), axis=0)
     cells = np.unique(entries[:, :2], axis=0)
-    size = 1 << (2 * len(cells) - 1).bit_length()
+    size = 1 << (max(2 * len(cells), _LEAST["cells"]) - 1).bit_length()
     keyed = np.unique(np.column_stack([_hash(entries[:, 0], entries[:, 1], size), entries[:, 2]]), axis=0)
     return {
-        "chunk_lane": _pad(chunk_lane, bucket(len(chunk_lane)), NO_LANE),
-        "chunk_span": _pad(span, bucket(len(span)), 0.0),
+        "chunk_lane": _pad(chunk_lane, bucket(len(chunk_lane), _LEAST["chunks"]), NO_LANE),
+        "chunk": _pad(chunks, bucket(len(chunks), _LEAST["chunks"]), 0.0),
         "cell_start": np.searchsorted(keyed[:, 0], np.arange(size + 1)),
-        "cell_chunks": _pad(keyed[:, 1], bucket(len(keyed)), 0),
+        "cell_chunks": _pad(keyed[:, 1], bucket(len(keyed), _LEAST["candidates"]), 0),
     }
