@@ -53,7 +53,7 @@ def two_phases(**fields):
     phases = (
         Phase(duration=20.0, state="Gg"),
         Phase(duration=3.0, state="yy"),
-        Phase(duration=10.0, state="ru", min_duration=5.0, max_duration=40.0, next=(0, 1)),
+        Phase(duration=10.0, state="ru", min_duration=5.0, max_duration=40.0, next=(1, 0)),
     )
     return Program(id="P", phases=phases, **fields)
 
@@ -68,7 +68,7 @@ def test_table_and_lookup():
     assert table.duration.tolist() == [[20, 3, 10], [1, 0, 0]]
     assert table.min_duration.tolist()[0] == [20, 3, 5]
     assert table.max_duration.tolist()[0] == [20, 3, 40]
-    assert table.next_phase.tolist()[0] == [1, 2, 0]
+    assert table.next_phase.tolist()[0] == [1, 2, 1]
     assert table.cycle.tolist() == [33, 1]
     assert table.lane_program[row[LINKS[1]]] == 0 and table.lane_link[row[LINKS[1]]] == 1
     assert table.lane_program[row["in0_0"]] == -1
@@ -317,7 +317,7 @@ def test_a_tee_keeps_the_through_road_green_across_stages():
         net.movements[m].via[0]: "".join(phase.state[link] for phase in program.phases)
         for link, (m,) in enumerate(program.movements)
     }
-    assert "G" in letters["in2_0>out0_0"]
+    assert sum("in2_0>out0_0" in stage for stage in greens(net)) >= 2
     for shown in letters.values():
         twice = shown * 2
         assert not re.search("[gG]r", twice) and not re.search("y[gG]", twice)  # green, yellow, red
