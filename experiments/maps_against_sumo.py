@@ -133,19 +133,21 @@ def _lanes(result: Comparison, ours: Network, theirs: Any) -> None:
 
 
 def _dense(lane: Lane) -> Array:
-    """Points every 10 cm along the centre line (m)."""
-    return lane.pose(np.linspace(0.0, lane.length, max(2, int(lane.length / 0.1))))[0]
+    """Points of the centre line (m), five from each sample to the next."""
+    parts = np.linspace(lane.s[:-1], lane.s[1:], 5, endpoint=False, axis=1)
+    return lane.pose(np.append(parts, lane.length))[0]
 
 
 def polyline_distance(points: Array, line: Array) -> Array:
     """Horizontal distance (m) of each point from a polyline."""
-    a, b = line[:-1, :2], line[1:, :2]
-    best = np.full(len(points), np.inf)
-    for start, end in zip(a, b, strict=True):
-        chord = end - start
-        u = np.clip((points[:, :2] - start) @ chord / max(chord @ chord, 1e-300), 0, 1)
-        best = np.minimum(best, np.hypot(*(points[:, :2] - start - u[:, None] * chord).T))
-    return best
+    start, chord = line[:-1, :2], np.diff(line[:, :2], axis=0)
+    square = np.maximum((chord**2).sum(1), 1e-300)
+    best = []
+    for block in np.array_split(points[:, :2], len(points) // 200 + 1):
+        offset = block[:, None] - start
+        u = np.clip(np.einsum("pij,ij->pi", offset, chord) / square, 0, 1)
+        best.append(np.sqrt(((offset - u[..., None] * chord) ** 2).sum(-1)).min(1))
+    return np.concatenate(best)
 
 
 def _connections(result: Comparison, ours: Network, theirs: Any) -> None:
