@@ -81,6 +81,7 @@ SIGNS = {
 }
 STOP_LINE_TYPES = {"294"}
 APPROACH = 60.0  # m; a sign further from the junction than this does not regulate it
+INSIDE = 10.0  # m; a stop line may lie this far inside the junction
 BESIDE = 12.0  # m; how far a sign may stand from the lane end that it regulates
 
 
@@ -359,7 +360,7 @@ class Furnisher:
         ]
 
     def _crossings(self, start: Array, end: Array, z: float) -> list[LaneSpot]:
-        """Where lane centre lines cross the segment at more than 45 degrees."""
+        """Where lane centre lines cross the segment at more than 45 degrees, before or early in a junction."""
         spots = []
         for lane in self._near(np.minimum(start, end), np.maximum(start, end), z):
             s = _crossing(lane, start, end)
@@ -367,6 +368,8 @@ class Furnisher:
                 continue
             _, heading = lane.pose(s)
             along = np.array([np.cos(heading), np.sin(heading)])
+            if lane.junction is not None and s > min(INSIDE, lane.length / 2):
+                continue  # the line of those who come the other way, or a guide line
             if abs(float(along @ (end - start))) < 0.71 * float(np.hypot(*(end - start))):
                 spots.append(LaneSpot(lane=lane.id, s=s))
         return spots

@@ -8,7 +8,7 @@ directions then make it a directed edge. So it does not matter which side said i
 from __future__ import annotations
 
 import itertools
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -466,8 +466,9 @@ def build_movements(
 def with_turns(movements: tuple[Movement, ...], lanes: dict[str, Lane]) -> tuple[Movement, ...]:
     """Turn of every movement: its change of heading, measured from the way that the road itself goes.
 
-    A motorway that bends inside a junction is no left turn: where the straightest movement of an
-    incoming road follows a bend of more than `BEND` radius, its change of heading counts as straight.
+    A motorway that bends inside a junction is no left turn: of the movements of an incoming road that
+    follow a bend of more than `BEND` radius, the one to the road with the most lanes (then the
+    straightest) counts as straight on.
     """
     angle = {
         m.index: sum(float(lanes[v].heading[-1] - lanes[v].heading[0]) for v in m.via) for m in movements
@@ -478,9 +479,12 @@ def with_turns(movements: tuple[Movement, ...], lanes: dict[str, Lane]) -> tuple
         by_road[m.junction, lanes[m.incoming].road].append(m.index)
     straight: dict[int, float] = {}
     for members in by_road.values():
-        best = min(members, key=lambda m: abs(angle[m]))
-        bends = abs(angle[best]) > 0 and length[best] / abs(angle[best]) > BEND
-        straight.update({m: angle[best] if bends else 0.0 for m in members})
+        lanes_to = Counter(lanes[movements[m].outgoing].road for m in members)
+        wide = [m for m in members if length[m] > BEND * abs(angle[m])]
+        best = max(
+            wide, key=lambda m: (lanes_to[lanes[movements[m].outgoing].road], -abs(angle[m])), default=None
+        )
+        straight.update({m: 0.0 if best is None else angle[best] for m in members})
     return tuple(replace(m, turn=_turn(angle[m.index] - straight[m.index])) for m in movements)
 
 
