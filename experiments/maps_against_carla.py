@@ -23,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -158,6 +158,7 @@ class Misfit:
     along: Array  # m, along the track, from where the road coordinate says
     heading: Array  # rad
     width: Array  # m
+    at: Array  # m, arc length of the foot point on the host lane
     device: Array  # m, across the track, of the device lane
     may_left: Array  # 1 or 0 where our lane has a driving lane beside it, else NaN
     may_right: Array
@@ -166,7 +167,7 @@ class Misfit:
     @classmethod
     def empty(cls, count: int) -> Misfit:
         """All NaN."""
-        return cls(*(np.full(count, np.nan) for _ in range(7)), lane=[""] * count)
+        return cls(*(np.full(count, np.nan) for _ in range(8)), lane=[""] * count)
 
     def bad(self) -> NDArray[np.bool_]:
         """Poses for which the host lane misses a threshold."""
@@ -197,6 +198,8 @@ class OurMap:
         for lane in network.lanes.values():
             if lane.type is LaneType.DRIVING:
                 self.lanes.setdefault((lane.road, lane.number), []).append(lane)
+        for lanes in self.lanes.values():
+            lanes.sort(key=lambda lane: min(lane.road_s[0], lane.road_s[-1]))
         self._device = device_poses(network)
 
     def misfit(self, where: Sequence[tuple[str, int]], s: Array, pose: Array, width: Array) -> Misfit:
@@ -212,6 +215,11 @@ class OurMap:
                 inside = rows[(s[rows] >= lo - 1e-6) & (s[rows] <= hi + 1e-6)]
                 if len(inside):
                     self._fit(lane, inside, s, pose, width, out)
+        known = np.flatnonzero(np.isfinite(out.lateral))
+        if len(known):
+            xy, heading = self._device([out.lane[i] for i in known], out.at[known])
+            delta = pose[known, :2] - xy
+            out.device[known] = np.abs(delta[:, 1] * np.cos(heading) - delta[:, 0] * np.sin(heading))
         return out
 
     def _fit(
@@ -221,18 +229,16 @@ class OurMap:
         at, lateral, residual = project(lane, pose[rows, :2], start)
         # A point beyond the end of the lane is off by as much as it is beyond, less rounding.
         lateral = np.hypot(lateral, np.maximum(np.abs(residual) - 1e-4, 0.0))
-        better = ~(lateral >= out.lateral[rows])  # also where there is none so far
+        # Where two lanes meet both are right; of the same road the later one is in charge.
+        better = ~(lateral > out.lateral[rows] + 1e-5)
         rows, at, start, lateral = rows[better], at[better], start[better], lateral[better]
         if not len(rows):
             return
-        out.lateral[rows], out.along[rows] = lateral, np.abs(at - start)
+        out.lateral[rows], out.along[rows], out.at[rows] = lateral, np.abs(at - start), at
         _, heading = lane.pose(at)
         out.heading[rows] = np.abs(np.angle(np.exp(1j * (pose[rows, 2] - heading))))
         # At the same road coordinate: where arc length is measured anew, points shift along the road.
         out.width[rows] = np.abs(width[rows] - lane.width_at(start))
-        on_device, device_heading = self._device(lane, at)
-        delta = pose[rows, :2] - on_device
-        out.device[rows] = np.abs(delta[:, 1] * np.cos(device_heading) - delta[:, 0] * np.sin(device_heading))
         out.may_left[rows] = lane.may_change_left if self._driving(lane.left) else np.nan
         out.may_right[rows] = lane.may_change_right if self._driving(lane.right) else np.nan
         for row in rows:
@@ -275,26 +281,27 @@ class OurMap:
         return found
 
 
-def device_poses(network: Network) -> Any:
-    """A function (lane, s) -> position `[K, 2]` and heading `[K]` of the device lane, in float64."""
+def device_poses(network: Network) -> Callable[[Sequence[str], Array], tuple[Array, Array]]:
+    """A function (lane ids, s) -> positions `[K, 2]` and headings `[K]` on the device, then in float64."""
     import jax
     import jax.numpy as jnp
 
-    from limsim_jax.maps import lane_map as lm
+    from limsim_jax.maps.lane_map import build_lane_map, lane_rows, pose
 
-    lane_map = lm.build_lane_map(network)
-    rows = lm.lane_rows(network)
+    lane_map = build_lane_map(network)
+    rows = lane_rows(network)
     origin = np.asarray(lane_map.origin, np.float64)[:2]
-    pose = jax.jit(lm.pose)
+    at = jax.jit(pose)
 
-    def at(lane: Lane, s: Array) -> tuple[Array, Array]:
-        size = 1 << max(6, (len(s) - 1).bit_length())  # few sizes, few compilations
+    def poses(lanes: Sequence[str], s: Array) -> tuple[Array, Array]:
+        size = 4 ** max(5, math.ceil(math.log(len(s), 4)))  # few sizes, few compilations
+        lane = np.zeros(size, np.int32)
+        lane[: len(s)] = [rows[i] for i in lanes]
         padded = jnp.asarray(np.pad(s, (0, size - len(s))), jnp.float32)
-        x, y, heading = pose(lane_map, jnp.full(size, rows[lane.id], jnp.int32), padded)
-        xy = np.stack([np.asarray(x, np.float64), np.asarray(y, np.float64)], -1)[: len(s)]
-        return xy + origin, np.asarray(heading, np.float64)[: len(s)]
+        x, y, heading = (np.asarray(v, np.float64)[: len(s)] for v in at(lane_map, jnp.asarray(lane), padded))
+        return np.stack([x, y], -1) + origin, heading
 
-    return at
+    return poses
 
 
 # --- Comparisons --------------------------------------------------------------------------------------------
@@ -399,22 +406,32 @@ def settle(
 ) -> NDArray[np.str_]:
     """Per waypoint of CARLA that misses our lane: why the file is on our side, or "" where it is not."""
     reasons = np.full(len(waypoints), "", f"U{max(map(len, (CARLA_ERRS, NEGATIVE, JUMPS)))}")
+    doubtful, poses, widths, valid = [], [], [], []
     for i in map(int, np.flatnonzero(fit.bad() | ~(fit.device < DEVICE_LATERAL))):
         road, number = where[i]
-        s, formulas = waypoints[i, 3], truth.roads[road]
+        formulas = truth.roads[road]
         # CARLA may attribute a place to a section that does not hold there.
-        section = formulas.section_at(s)
+        section = formulas.section_at(waypoints[i, 3])
         if (section, number) not in formulas.lane_elements:
             reasons[i] = CARLA_ERRS
             continue
-        place = formulas.lane(section, number, s)
-        pose = np.stack([place.x, place.y, place.heading], -1)
-        exact = ours.misfit([(road, number)], np.array([s]), pose, place.width)
-        if not exact.bad()[0] and exact.device[0] < DEVICE_LATERAL:
+        place = formulas.lane(section, number, waypoints[i, 3])
+        doubtful.append(i)
+        poses.append(place.pose[0])
+        widths.append(place.width[0])
+        valid.append(place.valid[0])
+    if not doubtful:
+        return reasons
+    s = waypoints[doubtful, 3]
+    exact = ours.misfit([where[i] for i in doubtful], s, np.array(poses), np.array(widths))
+    good = ~exact.bad() & (exact.device < DEVICE_LATERAL)
+    for k, i in enumerate(doubtful):
+        road, number = where[i]
+        if good[k]:
             reasons[i] = CARLA_ERRS
-        elif not place.valid[0]:
+        elif not valid[k]:
             reasons[i] = NEGATIVE
-        elif exact.heading[0] < HEADING and exact.lateral[0] <= formulas.jump(number, s, 1.0):
+        elif exact.heading[k] < HEADING and exact.lateral[k] <= truth.roads[road].jump(number, s[k], 1.0):
             reasons[i] = JUMPS
     return reasons
 
@@ -466,55 +483,51 @@ def compare_permissions(
 def compare_formulas(
     ours: OurMap, truth: OpenDriveFormulas, published: float | None, row: Comparison
 ) -> None:
-    """Our driving lanes at the formulas' places, and their length."""
-    lateral, headings, widths, device, lost, broken, bridged, count = [], [], [], [], [], 0, 0, 0
-    for road in truth.roads.values():
-        for record in road.lanes:
-            length = record.s1 - record.s0
-            if record.type != "driving" or length < 0.01:
-                continue
-            n = max(2, math.ceil(length))
-            s = record.s0 + np.concatenate([[2e-3], (np.arange(n) + 0.5) / n * length, [length - 2e-3]])
-            place = road.lane(record.section, record.number, s)
-            s, pose, width = (
-                a[place.valid] for a in (s, np.stack([place.x, place.y, place.heading], -1), place.width)
-            )
-            broken += int((~place.valid).sum())
-            count += len(s)
-            if not len(s):
-                continue
-            fit = ours.misfit([(record.road, record.number)] * len(s), s, pose, width)
-            for values, found in (
-                (lateral, fit.lateral), (headings, fit.heading), (widths, fit.width), (device, fit.device)
-            ):  # fmt: skip
-                values.append(found)
-            bad = fit.bad()
-            for i in np.flatnonzero(bad & (fit.lateral > 0) & (fit.heading < HEADING) & (fit.width < WIDTH)):
-                bad[i] = fit.lateral[i] > road.jump(record.number, s[i], 1.0)
-                bridged += not bad[i]
-            if bad.any():
-                i = np.flatnonzero(bad)
-                worst = i[np.argmax(np.nan_to_num(fit.lateral[i], nan=np.inf))]
-                lost.append(
-                    f"road {record.road} section {record.section} lane {record.number} s {s[worst]:.3f}"
-                    f" ({1e3 * fit.lateral[worst]:.1f} mm, {math.degrees(fit.heading[worst]):.2f} deg,"
-                    f" width {1e3 * fit.width[worst]:.1f} mm)"
-                )
-    everything = [np.concatenate(v) if v else np.zeros(0) for v in (lateral, headings, widths, device)]
+    """Our driving lanes at the formulas' places, about every metre, and their length."""
+    records, samples, poses, widths, excluded = [], [], [], [], 0
+    for record in truth.driving_lanes():
+        length = record.s1 - record.s0
+        if length < 0.01:
+            continue
+        n = max(2, math.ceil(length))
+        s = record.s0 + np.concatenate([[2e-3], (np.arange(n) + 0.5) / n * length, [length - 2e-3]])
+        place = truth.roads[record.road].lane(record.section, record.number, s)
+        excluded += int((~place.valid).sum())
+        records += [record] * int(place.valid.sum())
+        samples.append(s[place.valid])
+        poses.append(place.pose[place.valid])
+        widths.append(place.width[place.valid])
+    s, pose = np.concatenate([np.zeros(0), *samples]), np.concatenate([np.zeros((0, 3)), *poses])
+    fit = ours.misfit([(r.road, r.number) for r in records], s, pose, np.concatenate([np.zeros(0), *widths]))
+    bad = fit.bad()
+    bridged = 0
+    for i in map(int, np.flatnonzero(bad & (fit.heading < HEADING) & (fit.width < WIDTH))):
+        bad[i] = fit.lateral[i] > truth.roads[records[i].road].jump(records[i].number, s[i], 1.0)
+        bridged += not bad[i]
     row.figures["formulas"] = {
-        "samples": count,
-        "host": spread(everything[0]),
-        "device": spread(everything[3]),
-        "heading_deg": float(np.degrees(np.nanmax(everything[1], initial=0.0))),
-        "width": spread(everything[2]),
-        "excluded": broken,
+        "samples": len(s),
+        "host": spread(fit.lateral),
+        "device": spread(fit.device),
+        "heading_deg": float(np.degrees(np.nanmax(fit.heading, initial=0.0))),
+        "width": spread(fit.width),
+        "excluded": excluded,
     }
-    if broken:
-        row.exceptions.append(f"{broken} samples where the file's width is negative are left out")
+    if excluded:
+        row.exceptions.append(f"{excluded} samples where the file's width is negative are left out")
     if bridged:
         row.exceptions.append(f"{bridged} samples of the formulas: {JUMPS}")
-    if lost:
-        row.misses.append(f"formulas missed on {len(lost)} lane records, e.g. {'; '.join(lost[:3])}")
+    if bad.any():
+        worst = sorted(
+            map(int, np.flatnonzero(bad)), key=lambda i: -np.nan_to_num(fit.lateral[i], nan=np.inf)
+        )
+        text = [
+            f"road {records[i].road} section {records[i].section} lane {records[i].number} s {s[i]:.3f}"
+            f" ({1e3 * fit.lateral[i]:.1f} mm, {math.degrees(fit.heading[i]):.2f} deg,"
+            f" width {1e3 * fit.width[i]:.1f} mm)"
+            for i in worst[:3]
+        ]
+        lanes = len({records[i] for i in worst})
+        row.misses.append(f"formulas missed at {len(worst)} places of {lanes} lanes, e.g. {'; '.join(text)}")
     length = sum(lane.length for lanes in ours.lanes.values() for lane in lanes)
     exact = truth.driving_length()
     row.figures["driving_km"], row.figures["length_error"] = exact / 1e3, length / exact - 1 if exact else 0.0

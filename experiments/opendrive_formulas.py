@@ -186,6 +186,11 @@ class LanePlace:
     speed: Array  # metres along the lane centre per metre of road coordinate
     valid: NDArray[np.bool_]  # False where this lane or one between it and lane 0 has a negative width
 
+    @property
+    def pose(self) -> Array:
+        """x, y and heading `[K, 3]`."""
+        return np.stack([self.x, self.y, self.heading], -1)
+
 
 class RoadFormulas:
     """One <road>."""
@@ -324,7 +329,10 @@ class RoadFormulas:
         return f"{mark.get('type')}, " + ("laneChange absent" if change is None else f"laneChange={change}")
 
     def jump(self, number: int, s: float, reach: float) -> float:
-        """Largest gap (m) that the file leaves in a lane's centre line within `reach` of `s`."""
+        """Largest gap (m) that the file leaves in a lane's centre line within `reach` of `s`.
+
+        Gaps of 5 cm and more do not count: there another lane begins.
+        """
         side = 1 if number > 0 else -1
         knots = {g.s0 for g in self.geometries} | set(self.offset.s0.tolist()) | set(self.starts)
         for (section, n), (records, _) in self._profiles.items():
@@ -337,7 +345,8 @@ class RoadFormulas:
             if abs(knot - s) > reach or any((i, number) not in self.lane_elements for i in sections):
                 continue
             a, b = (self.lane(i, number, at) for i, at in zip(sections, (before, after), strict=True))
-            largest = max(largest, float(np.hypot(a.x - b.x, a.y - b.y)[0]) - 1e-6)
+            gap = float(np.hypot(a.x - b.x, a.y - b.y)[0]) - 1e-6
+            largest = max(largest, gap if gap < 0.05 else 0.0)
         return largest
 
     def lane_length(self, record: LaneRecord) -> float:
