@@ -344,6 +344,22 @@ def test_controllers_say_what_switches_together():
     check_safe(net)
 
 
+def test_arrows_govern_their_turn_alone():
+    """A left arrow over a shared lane sets the left turn apart, and the light beside it has the rest."""
+    net = lit(intersection())
+    (plain,) = [light for light in net.traffic_lights if light.id == "Lin0_0"]
+    arrow = dataclasses.replace(plain, id="arrow", turns=(Turn.LEFT,))
+    both = dataclasses.replace(net, traffic_lights=(*net.traffic_lights, arrow))
+    made = generate_programs(both)
+    (stage,) = [s for s in greens(made) if "in0_0>out3_0" in s]
+    assert not {name for name in stage if name.startswith("in2") and not name.endswith("out3_0")}
+    assert all(m.program == "J" for m in made.movements)
+    check_safe(made)
+    # Without the other lights, the arrow is all there is: nobody else is signalised.
+    only = generate_programs(dataclasses.replace(net, traffic_lights=(arrow,)))
+    assert [m.via[0] for m in only.movements if m.program] == ["in0_0>out3_0"]
+
+
 def test_single_approach_and_lights_without_movement():
     net = intersection(arms=(0, 180))
     alone = straight("pedestrian", (500, 0), 0.0, 80.0)

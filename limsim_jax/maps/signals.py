@@ -30,6 +30,7 @@ from limsim_jax.maps.network import (
     Network,
     Phase,
     Program,
+    TrafficLight,
     Turn,
 )
 
@@ -255,12 +256,13 @@ def generate_programs(network: Network, *, green: float = GREEN, green_turn: flo
     """The network with a program for every junction whose lights have no timing in the file.
 
     A movement is signalised if a traffic light stands for one of its connectors or for its incoming
-    lane; movements that already have a program keep it. Every junction gets one static program, a
-    link per movement:
+    lane (an arrow light: for its turn); movements that already have a program keep it. Every
+    junction gets one static program, a link per movement:
 
     - Units switch together: the movements of a controller, or where there is none (or where it
-      would show green to crossing traffic) those of an approach. Lanes that only turn across
-      the opposite direction are a unit of their own if they have somebody to yield to.
+      would show green to crossing traffic) those of an approach with the same arrow or none. Lanes
+      that only turn across the opposite direction are a unit of their own if they have somebody to
+      yield to.
     - Stages are sets of units that do not conflict. Turns across the opposite direction share its
       stage and yield, unless they are a unit of their own, which is then protected and comes before
       the rest of its approach. U-turns yield to everybody. A unit is green in every stage in which
@@ -273,13 +275,13 @@ def generate_programs(network: Network, *, green: float = GREEN, green_turn: flo
 
     Notes: one `approximated` per program, one `ignored` per light that governs no movement.
     """
-    lights: dict[str, list[str | None]] = defaultdict(list)
+    lights: dict[str, list[TrafficLight]] = defaultdict(list)
     for light in network.traffic_lights:
         for spot in light.spots:
-            lights[spot.lane].append(light.controller)
+            lights[spot.lane].append(light)
     signalised: dict[str, list[Movement]] = defaultdict(list)
     for movement in network.movements:
-        if movement.program is None and any(name in lights for name in (*movement.via, movement.incoming)):
+        if movement.program is None and _lights_of(movement, lights):
             signalised[movement.junction].append(movement)
     planner = _Planner(network, lights)
     programs, movements = dict(network.programs), list(network.movements)
@@ -298,13 +300,27 @@ def generate_programs(network: Network, *, green: float = GREEN, green_turn: flo
             f"junction {junction}",
             f"the lights have no timing; made a program of {len(stages)} stages, {cycle:g} s",
         )
-    governed = {name for m in movements if m.program is not None for name in (*m.via, m.incoming)}
+    governed: dict[str, set[Turn]] = defaultdict(set)
+    for movement in movements:
+        for name in (*movement.via, movement.incoming) if movement.program is not None else ():
+            governed[name].add(movement.turn)
     for light in network.traffic_lights:
-        if not any(spot.lane in governed for spot in light.spots):
+        turns = {turn for spot in light.spots for turn in governed.get(spot.lane, ())}
+        if not (turns & set(light.turns) if light.turns else turns):
             report.ignored(
                 "signal program", f"signal {light.id}", "governs no movement of a junction", light.line
             )
     return dataclasses.replace(network, programs=programs, movements=tuple(movements), report=report)
+
+
+def _lights_of(movement: Movement, lights: Mapping[str, Sequence[TrafficLight]]) -> list[TrafficLight]:
+    """The lights for a movement: those over its connectors, else over its incoming lane; arrows first."""
+    for names in (movement.via, (movement.incoming,)):
+        over = [light for name in names for light in lights.get(name, ())]
+        arrows = [light for light in over if movement.turn in light.turns]
+        if found := arrows or [light for light in over if not light.turns]:
+            return found
+    return []
 
 
 def _free_id(junction: str, taken: Set[str] | Mapping[str, object]) -> str:
@@ -323,7 +339,7 @@ class _Meeting:
 class _Planner:
     """Stages and times for the lights of junctions."""
 
-    def __init__(self, network: Network, lights: Mapping[str, Sequence[str | None]]) -> None:
+    def __init__(self, network: Network, lights: Mapping[str, Sequence[TrafficLight]]) -> None:
         self.network, self.lights = network, lights
         self.meetings: dict[tuple[int, int], _Meeting] = {}
         rows = {lane.id: row for row, lane in enumerate(network.drivable_lanes())}
@@ -375,11 +391,15 @@ class _Planner:
 
     def _units(self, members: Sequence[Movement]) -> list[list[Movement]]:
         """Movements that switch together, in file order."""
-        by_controller: dict[str | None, list[Movement]] = defaultdict(list)
+        together: dict[tuple[str | None, tuple[Turn, ...]], list[Movement]] = defaultdict(list)
         for movement in members:
-            by_controller[self._controller(movement)].append(movement)
+            over = _lights_of(movement, self.lights)
+            controller = min(
+                (light.controller for light in over if light.controller is not None), default=None
+            )
+            together[controller, over[0].turns if controller is None else ()].append(movement)
         units: list[list[Movement]] = []
-        for controller, unit in by_controller.items():
+        for (controller, _), unit in together.items():
             clash = any(self._hard(a, b) for a, b in itertools.combinations(unit, 2))
             if controller is not None and not clash:
                 units.append(unit)
@@ -391,12 +411,6 @@ class _Planner:
                 units.extend(self._split(approach, members))
         order = {movement.index: n for n, movement in enumerate(members)}
         return sorted(units, key=lambda unit: order[unit[0].index])
-
-    def _controller(self, movement: Movement) -> str | None:
-        """The controller of the lights over its connectors, else over its incoming lane."""
-        over = [c for name in movement.via for c in self.lights.get(name, ())]
-        over = over or list(self.lights.get(movement.incoming, ()))
-        return min((c for c in over if c is not None), default=None)
 
     def _split(self, approach: list[Movement], members: Sequence[Movement]) -> list[list[Movement]]:
         """Set apart the lanes of an approach that only turn across oncoming traffic, if there is any."""
