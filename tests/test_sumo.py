@@ -434,6 +434,13 @@ def test_lanes_of_a_bend_lie_abreast(read):
     assert a.length - b.length > 10
 
 
+def test_lanes_that_reach_beyond_the_middle_one(read):
+    shapes = ["0,0 100,0", "4,3 100,3", "-6,6 105,6"]
+    network = read(net(edge("e", *(lane("e", i, shape, 96) for i, shape in enumerate(shapes)))))
+    spans = [list(network.lanes[f"e_{i}"].road_s[[0, -1]]) for i in range(3)]
+    assert spans == [[-4, 96], [0, 96], [-10, 101]]
+
+
 # ---- shapes
 
 

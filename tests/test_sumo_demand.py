@@ -37,7 +37,8 @@ def read(tmp_path):
 @pytest.fixture
 def network(tmp_path):
     lanes = "".join(
-        f'<edge id="{e}" from="x" to="y"><lane id="{e}_0" index="0" speed="9" length="9" shape="0,0 9,0"/></edge>'
+        f'<edge id="{e}" from="x" to="y">'
+        f'<lane id="{e}_0" index="0" speed="9" length="9" shape="0,0 9,0"/></edge>'
         for e in "abc"
     )
     path = tmp_path / "map.net.xml"
@@ -222,7 +223,8 @@ def test_distributions(read):
              <route id="q" edges="x z" probability="4"/><route refId="r"/></routeDistribution>
            <vehicle id="1" depart="0" route="s" type="u"/>
            <vehicle id="2" depart="1"><routeDistribution>
-             <route edges="x y" probability="1"/><route edges="x z" probability="2"/></routeDistribution></vehicle>"""
+             <route edges="x y" probability="1"/><route edges="x z" probability="2"/>
+             </routeDistribution></vehicle>"""
     )
 
     def members(distribution: Distribution) -> dict[str, float]:
@@ -285,7 +287,8 @@ def test_flows(read, attributes, field, value):
 def test_intervals_and_included_files(read, tmp_path):
     (tmp_path / "more.rou.xml").write_text('<routes><route id="r" edges="x"/></routes>')
     demand = read(
-        '<include href="more.rou.xml"/><interval begin="5" end="9"><flow id="f" route="r" number="2"/></interval>'
+        '<include href="more.rou.xml"/>'
+        '<interval begin="5" end="9"><flow id="f" route="r" number="2"/></interval>'
     )
     assert (demand.flows["f"].begin, demand.flows["f"].end) == (5.0, 9.0) and "r" in demand.routes
     with pytest.raises(MapError, match="includes itself"):
