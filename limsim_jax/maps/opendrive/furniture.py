@@ -360,7 +360,7 @@ class Furnisher:
         ]
 
     def _crossings(self, start: Array, end: Array, z: float) -> list[LaneSpot]:
-        """Where lane centre lines cross the segment at more than 45 degrees, before or early in a junction."""
+        """Where centre lines cross the segment at over 45 degrees, before or early in a junction."""
         spots = []
         for lane in self._near(np.minimum(start, end), np.maximum(start, end), z):
             s = _crossing(lane, start, end)
