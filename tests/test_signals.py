@@ -277,7 +277,7 @@ def test_crossing_with_shared_lanes_has_two_stages(over):
     assert all(m.control is Control.SIGNAL and m.program == "J" for m in net.movements)
     assert [m.link for m in net.movements] == list(range(12))
     assert check_safe(net)
-    (note,) = [n for n in net.report.notes if n.action is Action.APPROXIMATED]
+    (note,) = [n for n in net.report.notes if n.action is Action.ADDED]
     assert "junction J" in note.where and "2 stages" in note.message
     table = build_signals(net, rows(net))
     assert table.state.shape == (2, 6, 12)

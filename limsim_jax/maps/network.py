@@ -53,6 +53,7 @@ class Action(enum.StrEnum):
     APPROXIMATED = "approximated"  # taken over, but not exactly
     IGNORED = "ignored"  # not taken over
     REPAIRED = "repaired"  # broken in the file, mended here
+    ADDED = "added"  # not in the file, and needed: made up here
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +96,10 @@ class ImportReport:
     def repaired(self, element: str, where: str, message: str, line: int | None = None) -> None:
         """Record an element that is broken in the file and was mended."""
         self._note(Action.REPAIRED, element, where, message, line)
+
+    def added(self, element: str, where: str, message: str, line: int | None = None) -> None:
+        """Record something needed that the file does not have and that was made up."""
+        self._note(Action.ADDED, element, where, message, line)
 
     def _note(
         self, action: Action, element: str, where: str, message: str, line: int | None, count: int = 1

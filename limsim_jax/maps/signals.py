@@ -273,7 +273,7 @@ def generate_programs(network: Network, *, green: float = GREEN, green_turn: flo
     - Green is major where nobody else who is green goes first, else minor.
     - A junction with a single stage alternates with 10 s of red.
 
-    Notes: one `approximated` per program, one `ignored` per light that governs no movement.
+    Notes: one `added` per program, one `ignored` per light that governs no movement.
     """
     lights: dict[str, list[TrafficLight]] = defaultdict(list)
     for light in network.traffic_lights:
@@ -281,12 +281,14 @@ def generate_programs(network: Network, *, green: float = GREEN, green_turn: flo
             lights[spot.lane].append(light)
     signalised: dict[str, list[Movement]] = defaultdict(list)
     for movement in network.movements:
-        if movement.program is None and _lights_of(movement, lights):
+        lit = movement.control is Control.SIGNAL or _lights_of(movement, lights)
+        if movement.program is None and lit:
             signalised[movement.junction].append(movement)
-    planner = _Planner(network, lights)
+    planner = _Planner(network, lights) if signalised else None
     programs, movements = dict(network.programs), list(network.movements)
     report = ImportReport(counts=network.report.counts.copy(), notes=list(network.report.notes))
     for junction, members in signalised.items():
+        assert planner is not None
         stages = planner.stages(members)
         program = planner.program(_free_id(junction, programs), members, stages, green, green_turn)
         programs[program.id] = program
@@ -295,7 +297,7 @@ def generate_programs(network: Network, *, green: float = GREEN, green_turn: flo
                 movement, program=program.id, link=link, control=Control.SIGNAL
             )
         cycle = sum(phase.duration for phase in program.phases)
-        report.approximated(
+        report.added(
             "signal program",
             f"junction {junction}",
             f"the lights have no timing; made a program of {len(stages)} stages, {cycle:g} s",
@@ -350,9 +352,7 @@ class _Planner:
             for name in movement.via:
                 through[name].append((movement, entry))
                 entry += network.lanes[name].length
-        table = build_conflicts(network, rows) if lights else None
-        if table is None:
-            return
+        table = build_conflicts(network, rows)
         meets = (table.type == ConflictType.CROSS) | (table.type == ConflictType.MERGE)
         for k, c in np.argwhere(np.asarray(meets)):
             lane, foe = ids[table.lane[k]], ids[table.lane[table.foe[k, c]]]
