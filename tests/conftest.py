@@ -11,6 +11,14 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
+from beartype import BeartypeConf, beartype  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
+
+# Shapes and types of these modules are checked in every call. Only modules of functions: the pytrees
+# that JAX rebuilds with placeholders inside would not pass.
+typecheck = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float
+_hooked = [f"limsim_jax.maps.{name}" for name in ("conflicts", "routing", "signals")]
+install_import_hook(_hooked, "conftest.typecheck")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
