@@ -328,8 +328,8 @@ class RoadFormulas:
         change = mark.get("laneChange")
         return f"{mark.get('type')}, " + ("laneChange absent" if change is None else f"laneChange={change}")
 
-    def jump(self, number: int, s: float, reach: float) -> float:
-        """Largest gap (m) that the file leaves in a lane's centre line within `reach` of `s`.
+    def breaks(self, number: int, s: float, reach: float) -> tuple[float, float]:
+        """Largest sideways gap (m) and kink (rad) in a lane's centre line within `reach` of `s`.
 
         Gaps of 5 cm and more do not count: there another lane begins.
         """
@@ -338,16 +338,19 @@ class RoadFormulas:
         for (section, n), (records, _) in self._profiles.items():
             if n * side > 0 and abs(n) <= abs(number):
                 knots |= {self.starts[section] + float(b) for b in records.s0}
-        largest = 0.0
-        for knot in knots:
+        gaps, kinks = [0.0], [0.0]
+        for knot in (k for k in knots if abs(k - s) <= reach):
             before, after = max(knot - 1e-7, 0.0), min(knot + 1e-7, self.length)
             sections = self.section_at(before), self.section_at(after)
-            if abs(knot - s) > reach or any((i, number) not in self.lane_elements for i in sections):
+            if any((i, number) not in self.lane_elements for i in sections):
                 continue
-            a, b = (self.lane(i, number, at) for i, at in zip(sections, (before, after), strict=True))
-            gap = float(np.hypot(a.x - b.x, a.y - b.y)[0]) - 1e-6
-            largest = max(largest, gap if gap < 0.05 else 0.0)
-        return largest
+            a, b = (self.lane(i, number, at).pose[0] for i, at in zip(sections, (before, after), strict=True))
+            (dx, dy, turn), heading = b - a, a[2]
+            sideways = abs(dy * math.cos(heading) - dx * math.sin(heading))
+            if sideways < 0.05:
+                gaps.append(sideways)
+                kinks.append(abs(math.remainder(turn, math.tau)))
+        return max(gaps), max(kinks)
 
     def lane_length(self, record: LaneRecord) -> float:
         """Arc length of a lane centre: Gauss-Legendre between all places where a record changes."""
