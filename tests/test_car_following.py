@@ -77,7 +77,8 @@ def plain_acc(p, s, v, v_l, a_l, v0):
 def test_accelerations_equal_the_table(state, idm, iidm, acc):
     """Table of accelerations at T = 1.5 s, s0 = 2 m, a = 1.4, b = 2, v0 = 120 km/h; in single precision."""
     driver = make_driver(b_max=100.0)
-    found = [float(accelerate(model, driver, *state, HIGHWAY)) for model in MODELS]
+    gap, v, v_lead, a_lead = state
+    found = [float(accelerate(model, driver, gap, v, v_lead, a_lead, HIGHWAY)) for model in MODELS]
     np.testing.assert_allclose(found, [idm, iidm, acc], rtol=2e-5, atol=2e-5)
 
 
@@ -102,7 +103,7 @@ def test_accelerations_equal_the_plain_formulas(model):
         if isinstance(model, cf.ACC):
             want.append(plain_acc(q, s[i], v[i], v_l[i], a_l[i], v0[i]))
         else:
-            plain = plain_idm if isinstance(model, cf.IDM) else plain_iidm
+            plain = {cf.IDM: plain_idm, cf.IIDM: plain_iidm}[type(model)]
             want.append(plain(q, s[i], v[i], v_l[i], v0[i]))
     with jax.enable_x64(True):
         found = np.asarray(accelerate(model, make_driver((n,), b_max=100.0, **p), s, v, v_l, a_l, v0))
@@ -347,24 +348,19 @@ def platoon(model, driver, start_gap, v, lead_v, lead_a, dt, v0):
     A leader of speed NaN is none.
     """
 
-    def step(state, lead):
+    first = jnp.arange(v.shape[0]) == 0
+
+    def step(state: tuple[jax.Array, ...], lead: tuple[jax.Array, jax.Array]):
         gap, v, a = state
         speed, change = lead
-        none = jnp.isnan(speed)
-        seen = jnp.where(none, cf.NO_GAP, gap[0])
-        v_lead = jnp.concatenate([jnp.where(none, v[0], speed)[None], v[:-1]])
-        a_lead = jnp.concatenate([jnp.where(none, 0, change)[None], a[:-1]])
-        wish = model(
-            driver,
-            gap=jnp.concatenate([seen[None], gap[1:]]),
-            v=v,
-            v_lead=v_lead,
-            a_lead=a_lead,
-            v0=v0,
-        )
+        none = first & jnp.isnan(speed)
+        v_lead = jnp.where(none, v, jnp.where(first, speed, jnp.roll(v, 1)))
+        a_lead = jnp.where(none, 0.0, jnp.where(first, change, jnp.roll(a, 1)))
+        seen = jnp.where(none, cf.NO_GAP, gap)
+        wish = model(driver, gap=seen, v=v, v_lead=v_lead, a_lead=a_lead, v0=v0)
         v_new, distance = cf.ballistic(v, wish, dt)
-        _, ahead = cf.ballistic(jnp.where(none, 0, speed), jnp.where(none, 0, change), dt)
-        gap = gap + jnp.concatenate([ahead[None], distance[:-1]]) - distance
+        _, ahead = cf.ballistic(v_lead, a_lead, dt)
+        gap = gap + jnp.where(first, ahead, jnp.roll(distance, 1)) - distance
         return (gap, v_new, (v_new - v) / dt), (v_new, gap, distance)
 
     return jax.lax.scan(step, (start_gap, v, jnp.zeros_like(v)), (lead_v, lead_a))[1]

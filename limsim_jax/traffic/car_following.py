@@ -27,7 +27,7 @@ from typing import Protocol
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from limsim_jax.numerics import safe_divide, safe_sqrt
 from limsim_jax.types import Driver
@@ -165,7 +165,8 @@ def string_stability(driver: Driver, v: Values, v0: Values) -> Float[Array, "*b"
     perturbations from vehicle to vehicle where it is negative (Treiber, Kesting 2013, ch. 15). The IIDM
     and the ACC-IDM have a kink in equilibrium and no such linearisation.
     """
-    s, v = jnp.broadcast_arrays(equilibrium_gap(IDM(), driver, v, v0), v)
+    s = equilibrium_gap(IDM(), driver, v, v0)
+    v = jnp.broadcast_to(v, s.shape)
 
     def acceleration(s: Array, v: Array, v_lead: Array) -> Array:
         return IDM()(driver, gap=s, v=v, v_lead=v_lead, a_lead=jnp.zeros_like(s), v0=v0)

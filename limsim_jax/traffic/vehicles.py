@@ -1,0 +1,484 @@
+"""Who is on the road: vehicle classes, their sizes and limits, and drivers from cautious to aggressive.
+
+A `Population` is a mixture of types. Within a type every parameter has a truncated log-normal
+distribution (`speed_factor` and `svo`: normal), and a Gaussian copula joins them: two standard normal
+scores per vehicle, aggressiveness and size, correlate with the score of each parameter by its `loading`.
+`sample` draws one vehicle from one key, so a vehicle depends on its key alone and not on its batch.
+
+The default values and their sources stand in `DEFAULTS`; `experiments/vehicle_table.py` prints them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.scipy.special import ndtr, ndtri
+from jaxtyping import Array, Float, Int, Key
+
+from limsim_jax.maps.lane_map import VEHICLE_CLASSES
+from limsim_jax.maps.network import MapError
+from limsim_jax.maps.sumo_demand import VehicleType
+from limsim_jax.types import Driver, Shape
+
+BODY = ("length", "width", "wheelbase")
+PARAMETERS = (*(field.name for field in fields(Driver)), *BODY)
+"""Names of the columns `P` of a `Population`."""
+
+CUT = 2.5
+"""Standard deviations from the median at which the default distributions end."""
+
+NORMAL = ("speed_factor", "svo")
+"""Parameters with a normal instead of a log-normal distribution."""
+
+_IS_NORMAL = np.array([name in NORMAL for name in PARAMETERS])
+_LATENT = np.array([int(name in BODY) for name in PARAMETERS])  # 0 aggressiveness, 1 size
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Population:
+    """Types `Y` of vehicles, and the distributions of their `PARAMETERS` `P`."""
+
+    vehicle_class: Int[Array, " Y"]  # index into maps.lane_map.VEHICLE_CLASSES
+    share: Float[Array, " Y"]  # of the vehicles that enter; weights, need not sum to 1
+    median: Float[Array, "Y P"]  # before truncation
+    spread: Float[Array, "Y P"]  # standard deviation of the logarithm, or of the value if `NORMAL`
+    loading: Float[Array, "Y P"]  # -1..1, correlation with aggressiveness (of bodies: size)
+    lower: Float[Array, "Y P"]
+    upper: Float[Array, "Y P"]
+
+
+def sample(
+    population: Population, key: Key[Array, ""], vehicle_type: Int[Array, ""] | None = None
+) -> tuple[Driver, Shape]:
+    """One vehicle and its driver, every leaf of shape `[]`.
+
+    Args:
+      population: whom to draw from.
+      key: of this vehicle, and of nothing else; is consumed.
+      vehicle_type: row of the population; drawn by `share` if not given.
+    """
+    type_key, latent_key, own_key = jax.random.split(key, 3)
+    if vehicle_type is None:
+        total = jnp.cumsum(population.share)
+        draw = jax.random.uniform(type_key) * total[-1]
+        # Some vehicle of the last type that has a share, should rounding take `draw` to the end.
+        vehicle_type = jnp.argmax((draw < total) | (total == total[-1])).astype(jnp.int32)
+    median, spread, loading, lower, upper = (
+        leaf[vehicle_type]
+        for leaf in (
+            population.median,
+            population.spread,
+            population.loading,
+            population.lower,
+            population.upper,
+        )
+    )
+    latent = jax.random.normal(latent_key, (2,))[_LATENT]
+    own = jax.random.normal(own_key, median.shape)
+    score = loading * latent + jnp.sqrt(1 - loading * loading) * own
+
+    def scale(x: Array) -> Array:
+        return jnp.where(_IS_NORMAL, x, jnp.log(jnp.maximum(x, 1e-30)))
+
+    # Truncation by the inverse distribution function: no redrawing, and no heap at the bounds.
+    width = jnp.where(spread > 0, spread, 1)
+    low, high = ndtr((scale(lower) - scale(median)) / width), ndtr((scale(upper) - scale(median)) / width)
+    quantile = jnp.clip(low + (high - low) * ndtr(score), 1e-7, 1 - 1e-7)
+    x = scale(median) + spread * ndtri(quantile)
+    x = jnp.clip(jnp.where(_IS_NORMAL, x, jnp.exp(x)), lower, upper)
+    values = dict(zip(PARAMETERS, x, strict=True))
+    body = {name: values.pop(name) for name in BODY}
+    return Driver(**values), Shape(**body, vehicle_class=population.vehicle_class[vehicle_type])
+
+
+def sample_vehicles(
+    population: Population,
+    key: Key[Array, ""],
+    vehicle: Int[Array, " N"],
+    vehicle_type: Int[Array, " N"] | None = None,
+) -> tuple[Driver, Shape]:
+    """Vehicles by number, every leaf of shape `[N]`; equal numbers give equal vehicles.
+
+    Args:
+      population: whom to draw from.
+      key: of the world; vehicle i uses `fold_in(key, i)`.
+      vehicle: numbers, in any order.
+      vehicle_type: rows of the population; drawn by `share` if not given.
+    """
+    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(vehicle)
+    if vehicle_type is None:
+        return jax.vmap(lambda k: sample(population, k))(keys)
+    return jax.vmap(lambda k, y: sample(population, k, y))(keys, vehicle_type)
+
+
+# ---- populations
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """Default distribution of a parameter; tuples have one value per class of `VEHICLE_CLASSES`."""
+
+    meaning: str
+    unit: str
+    median: tuple[float, ...]
+    spread: float | tuple[float, ...] = 0.0
+    loading: float = 0.0
+    bounds: tuple[float, float] = (0.0, math.inf)  # on top of `CUT`
+    vtype: str = ""  # attribute of a SUMO vType that sets it
+    source: str
+
+
+_ALL = len(VEHICLE_CLASSES)
+_ACC = "Kesting, Treiber, Helbing (2010)"
+_MOBIL = "Kesting, Treiber, Helbing (2007)"
+_FGSV = "FGSV design vehicles (2001), which are 85th percentiles"
+
+# Where a source has one number, or one for cars and one for trucks, the other classes and all spreads and
+# loadings are choices of this project.
+DEFAULTS: dict[str, Parameter] = {
+    "speed_factor": Parameter(
+        meaning="desired speed over the speed limit",
+        unit="1",
+        median=(1.0,) * _ALL,
+        spread=(0.1, 0.05, 0.05, 0.05, 0.1, 0.1),
+        loading=0.6,
+        vtype="speedFactor, speedDev",
+        source="SUMO defaults (speedDev)",
+    ),
+    "v_max": Parameter(
+        meaning="speed never exceeded",
+        unit="m/s",
+        median=(50.0, 38.9, 25.0, 27.8, 50.0, 44.4),
+        spread=(0.1, 0.05, 0.01, 0.01, 0.1, 0.05),
+        loading=0.3,
+        vtype="maxSpeed",
+        source="trucks 90 km/h, buses 100 km/h: Directive 92/6/EEC as amended by 2002/85/EC",
+    ),
+    "T": Parameter(
+        meaning="time gap",
+        unit="s",
+        median=(1.2, 1.2, 1.6, 1.6, 1.1, 1.1),
+        spread=0.25,
+        loading=-0.7,
+        bounds=(0.6, 3.0),
+        vtype="tau",
+        source=f"between 1.0 (Treiber, Kesting 2013, Tab. 11.2) and 1.5 ({_ACC}); trucks 4/3 of cars",
+    ),
+    "s0": Parameter(
+        meaning="standstill gap",
+        unit="m",
+        median=(2.0, 2.0, 3.0, 3.0, 1.5, 2.0),
+        spread=0.2,
+        loading=-0.5,
+        bounds=(1.0, 5.0),
+        vtype="minGap",
+        source=f"{_ACC}: cars 2, trucks 4",
+    ),
+    "a": Parameter(
+        meaning="largest acceleration",
+        unit="m/s^2",
+        median=(1.5, 1.3, 0.8, 1.0, 2.5, 1.8),
+        spread=0.2,
+        loading=0.6,
+        vtype="accel",
+        source=f"{_ACC}: cars 1.4, trucks 0.7; SUMO defaults: buses 1.2",
+    ),
+    "b": Parameter(
+        meaning="comfortable deceleration",
+        unit="m/s^2",
+        median=(2.0, 2.0, 2.0, 1.5, 2.5, 2.5),
+        spread=0.2,
+        loading=0.6,
+        bounds=(0.8, 4.0),
+        vtype="decel",
+        source=f"{_ACC}: 2",
+    ),
+    "delta": Parameter(
+        meaning="acceleration exponent",
+        unit="1",
+        median=(4.0,) * _ALL,
+        vtype="delta",
+        source="Treiber, Hennecke, Helbing (2000)",
+    ),
+    "b_max": Parameter(
+        meaning="hardest braking, dry road",
+        unit="m/s^2",
+        median=(8.5, 8.0, 6.5, 6.5, 8.5, 8.5),
+        spread=0.03,
+        bounds=(0.0, 9.0),
+        vtype="emergencyDecel",
+        source="below the SUMO defaults (emergencyDecel): cars 9, trucks and buses 7, motorcycles 10",
+    ),
+    "coolness": Parameter(
+        meaning="trust that the leader does not brake hard",
+        unit="1",
+        median=(0.99,) * _ALL,
+        bounds=(0.0, 1.0),
+        source=_ACC,
+    ),
+    "politeness": Parameter(
+        meaning="MOBIL p, weight of others' accelerations",
+        unit="1",
+        median=(0.25, 0.25, 0.25, 0.25, 0.25, 0.1),
+        spread=0.5,
+        loading=-0.6,
+        bounds=(0.0, 1.0),
+        source=f"{_MOBIL}: 0 to 1",
+    ),
+    "threshold": Parameter(
+        meaning="MOBIL a_th, least advantage of a lane change",
+        unit="m/s^2",
+        median=(0.15,) * _ALL,
+        spread=0.3,
+        loading=-0.3,
+        source=f"{_MOBIL}: 0.1; traffic-simulation.de: 0.2",
+    ),
+    "b_safe": Parameter(
+        meaning="braking that a lane change may ask of the follower",
+        unit="m/s^2",
+        median=(3.0,) * _ALL,
+        spread=0.15,
+        loading=0.5,
+        bounds=(1.5, 6.0),
+        source=f"below the 4 of {_MOBIL}",
+    ),
+    "keep_right": Parameter(
+        meaning="MOBIL bias towards the outer lane, where the map asks for it",
+        unit="m/s^2",
+        median=(0.3,) * _ALL,
+        source=_MOBIL,
+    ),
+    "lane_change_time": Parameter(
+        meaning="duration of a lane change",
+        unit="s",
+        median=(4.5, 4.5, 5.5, 5.5, 3.5, 4.0),
+        spread=0.18,
+        loading=-0.4,
+        bounds=(3.0, 7.0),
+        source="below the mean of 5 to 6 s that Toledo, Zohar (2007), TRR 1999, report",
+    ),
+    "a_lat": Parameter(
+        meaning="lateral acceleration accepted in bends",
+        unit="m/s^2",
+        median=(2.5, 2.3, 1.8, 1.5, 3.0, 3.0),
+        spread=0.15,
+        loading=0.5,
+        source="comfort of passengers; SUMO limits the speed of turns at 5.5",
+    ),
+    "gap_factor": Parameter(
+        meaning="factor on the gaps accepted at junctions",
+        unit="1",
+        median=(1.0, 1.0, 1.2, 1.2, 1.0, 0.9),
+        spread=0.2,
+        loading=-0.6,
+        bounds=(0.6, 1.8),
+        source="heavy vehicles: HCM (2010), 1 s more than cars on a critical headway of 4 to 7 s",
+    ),
+    "svo": Parameter(
+        meaning="social value orientation",
+        unit="rad",
+        median=(0.39,) * _ALL,
+        spread=0.2,
+        loading=-0.6,
+        bounds=(-0.21, 1.0),
+        source="Murphy, Ackermann, Handgraaf (2011): 22.45 degrees part individualists from prosocials",
+    ),
+    "length": Parameter(
+        meaning="length",
+        unit="m",
+        median=(4.5, 6.0, 8.5, 12.0, 2.2, 6.0),
+        spread=(0.05, 0.13, 0.1, 0.03, 0.04, 0.1),
+        loading=0.95,
+        bounds=(0.0, 13.5),
+        vtype="length",
+        source=f"{_FGSV}: 4.74, 6.89, 9.46; buses 12.0; motorcycles: SUMO defaults",
+    ),
+    "width": Parameter(
+        meaning="width without mirrors",
+        unit="m",
+        median=(1.8, 2.05, 2.5, 2.5, 0.9, 2.1),
+        spread=(0.03, 0.03, 0.01, 0.01, 0.04, 0.03),
+        loading=0.8,
+        bounds=(0.0, 2.55),
+        vtype="width",
+        source="SUMO defaults (vans 2.16, trucks 2.4); at most 2.55: Directive 96/53/EC",
+    ),
+    "wheelbase": Parameter(
+        meaning="front to rear axle",
+        unit="m",
+        median=(2.6, 3.45, 4.7, 5.8, 1.45, 3.45),
+        spread=(0.05, 0.13, 0.1, 0.03, 0.04, 0.1),
+        loading=0.95,
+        vtype="length",
+        source="ratio to the length: FGSV design vehicles, 2.70, 3.95, 5.20, 5.80 m",
+    ),
+}
+
+URBAN = {"car": 0.82, "van": 0.09, "truck": 0.03, "bus": 0.02, "motorcycle": 0.035, "emergency": 0.005}
+"""Shares of the classes in towns: a choice of this project."""
+
+HIGHWAY = {"car": 0.78, "van": 0.08, "truck": 0.12, "bus": 0.01, "motorcycle": 0.009, "emergency": 0.001}
+"""Shares of the classes on highways: a choice of this project."""
+
+
+def default_population(shares: Mapping[str, float] = URBAN) -> Population:
+    """One type per class, in the order of `VEHICLE_CLASSES`, distributed by `DEFAULTS`.
+
+    Args:
+      shares: weight per class; classes that are left out do not occur.
+
+    Raises:
+      ValueError: a class is unknown, a share negative, or none positive.
+    """
+    _check_known("vehicle class", shares, VEHICLE_CLASSES)
+    return _population([(name, shares.get(name, 0.0), _default_rows(name)) for name in VEHICLE_CLASSES])
+
+
+def uniform_population(vehicle_class: str = "car", **parameters: float) -> Population:
+    """A population of equal vehicles: the medians of a class, with what `parameters` say instead.
+
+    Raises:
+      ValueError: the class or a parameter is unknown.
+    """
+    _check_known("vehicle class", [vehicle_class], VEHICLE_CLASSES)
+    _check_known("parameter", parameters, PARAMETERS)
+    rows = {name: _fixed(row.median) for name, row in _default_rows(vehicle_class).items()}
+    rows |= {name: _fixed(value) for name, value in parameters.items()}
+    return _population([(vehicle_class, 1.0, rows)])
+
+
+def from_vtypes(types: Sequence[VehicleType]) -> Population:
+    """SUMO's vehicle types, one row each in the given order, with their probabilities as shares.
+
+    What a vType gives is the same for all its vehicles but for the speed factor, which is drawn. `tau`,
+    `minGap`, `accel`, `decel`, `emergencyDecel`, `maxSpeed` become T, s0, a, b, b_max, v_max whatever the
+    car-following model; `sigma` is ignored, for these models know no such imperfection. The wheelbase
+    goes with the length. All else (lane changes, bends, gaps at junctions) is distributed as `DEFAULTS`
+    say for the class.
+
+    Raises:
+      MapError: there are no types, one is of no motor vehicle, or no probability is positive.
+    """
+    members = []
+    for vtype in types:
+        if vtype.engine_class is None:
+            raise MapError(
+                f"vClass '{vtype.vehicle_class}' is no motor traffic on roads; leave the type out",
+                line=vtype.line,
+                element=f"vType {vtype.id}",
+            )
+        rows = _default_rows(vtype.engine_class)
+        given = {
+            "v_max": vtype.max_speed,
+            "T": vtype.tau,
+            "s0": vtype.min_gap,
+            "a": vtype.accel,
+            "b": vtype.decel,
+            "b_max": max(vtype.emergency_decel, vtype.decel),
+            "length": vtype.length,
+            "width": vtype.width,
+            "wheelbase": vtype.length * rows["wheelbase"].median / rows["length"].median,
+        }
+        if "delta" in vtype.parameters:
+            given["delta"] = _number(vtype, "delta")
+        rows |= {name: _fixed(value) for name, value in given.items()}
+        factor = vtype.speed_factor
+        rows["speed_factor"] = (
+            _Row(factor.mean, factor.deviation, rows["speed_factor"].loading, factor.minimum, factor.maximum)
+            if factor.deviation > 0
+            else _fixed(factor.mean)
+        )
+        members.append((vtype.engine_class, vtype.probability, rows))
+    if not any(share > 0 for _, share, _ in members):
+        raise MapError("no vehicle type with a positive probability", element="vType")
+    return _population(members)
+
+
+@dataclass(frozen=True)
+class _Row:
+    """Distribution of one parameter of one type: an entry of every array of a `Population`."""
+
+    median: float
+    spread: float
+    loading: float
+    lower: float
+    upper: float
+
+
+def _fixed(value: float) -> _Row:
+    return _Row(value, 0.0, 0.0, value, value)
+
+
+def _default_rows(vehicle_class: str) -> dict[str, _Row]:
+    column = VEHICLE_CLASSES.index(vehicle_class)
+    rows = {}
+    for name, parameter in DEFAULTS.items():
+        median = parameter.median[column]
+        spread = parameter.spread[column] if isinstance(parameter.spread, tuple) else parameter.spread
+        if spread == 0:
+            rows[name] = _fixed(median)
+            continue
+        if name in NORMAL:
+            low, high = median - CUT * spread, median + CUT * spread
+        else:
+            low, high = median * math.exp(-CUT * spread), median * math.exp(CUT * spread)
+        least, most = parameter.bounds
+        rows[name] = _Row(median, spread, parameter.loading, max(low, least), min(high, most))
+    return rows
+
+
+def _check_known(kind: str, names: Iterable[str], known: Sequence[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise ValueError(f"{kind} '{name}' is unknown; known are {', '.join(known)}")
+
+
+def _number(vtype: VehicleType, attribute: str) -> float:
+    text = vtype.parameters[attribute]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        message = f"{attribute}='{text[:40]}' is no positive number"
+        raise MapError(message, line=vtype.line, element=f"vType {vtype.id}")
+    return value
+
+
+def _population(members: Sequence[tuple[str, float, Mapping[str, _Row]]]) -> Population:
+    classes, shares, rows = zip(*members, strict=True)
+    if not all(0 <= share < math.inf for share in shares) or sum(shares) <= 0:
+        raise ValueError(f"shares have to be 0 or more, and one of them positive: {list(shares)}")
+
+    def table(name: str) -> Array:
+        return jnp.array([[getattr(row[p], name) for p in PARAMETERS] for row in rows], jnp.float32)
+
+    return Population(
+        vehicle_class=jnp.array([VEHICLE_CLASSES.index(name) for name in classes], jnp.int32),
+        share=jnp.array(shares, jnp.float32),
+        **{field.name: table(field.name) for field in fields(_Row)},
+    )
+
+
+__all__ = [
+    "BODY",
+    "CUT",
+    "DEFAULTS",
+    "HIGHWAY",
+    "NORMAL",
+    "PARAMETERS",
+    "URBAN",
+    "Parameter",
+    "Population",
+    "default_population",
+    "from_vtypes",
+    "sample",
+    "sample_vehicles",
+    "uniform_population",
+]
