@@ -17,12 +17,12 @@ Box = Float[Array, "5"]
 """x, y of the centre (m), heading (rad), length, width (m)."""
 
 
-def wrap_angle(angle: Float[Array, "*b"]) -> Float[Array, "*b"]:
+def wrap_angle(angle: Float[Array, "*#b"]) -> Float[Array, "*#b"]:
     """The same angle within [-pi, pi]; its gradient is 1 everywhere."""
     return angle - 2 * math.pi * jnp.round(angle / (2 * math.pi))
 
 
-def direction(dx: Float[Array, "*b"], dy: Float[Array, "*b"]) -> Float[Array, "*b"]:
+def direction(dx: Float[Array, "*#b"], dy: Float[Array, "*#b"]) -> Float[Array, "*#b"]:
     """Angle of the vector (dx, dy) in [-pi, pi]; 0 with zero gradient for the zero vector."""
     zero = (dx == 0) & (dy == 0)
     return jnp.where(zero, 0, jnp.arctan2(dy, jnp.where(zero, 1, dx)))

@@ -15,14 +15,14 @@ Axis = int | Sequence[int] | None
 
 
 def safe_divide(
-    numerator: Float[Array, "*b"], denominator: Float[Array, "*b"], default: float = 0.0
-) -> Float[Array, "*b"]:
+    numerator: Float[Array, "*#b"], denominator: Float[Array, "*#b"], default: float = 0.0
+) -> Float[Array, "*#b"]:
     """`numerator / denominator`, and `default` with zero gradient where the denominator is 0."""
     zero = denominator == 0
     return jnp.where(zero, default, numerator / jnp.where(zero, 1, denominator))
 
 
-def safe_sqrt(x: Float[Array, "*b"]) -> Float[Array, "*b"]:
+def safe_sqrt(x: Float[Array, "*#b"]) -> Float[Array, "*#b"]:
     """Square root of `x`, and 0 with zero gradient where `x <= 0`."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
@@ -33,13 +33,13 @@ def safe_norm(x: Float[Array, ...], axis: Axis = -1) -> Float[Array, ...]:
     return safe_sqrt(jnp.sum(x * x, axis=_axes(axis)))
 
 
-def masked_sum(x: Float[Array, "*b"], mask: Bool[Array, "*b"], axis: Axis = None) -> Float[Array, ...]:
+def masked_sum(x: Float[Array, "*#b"], mask: Bool[Array, "*#b"], axis: Axis = None) -> Float[Array, ...]:
     """Sum of `x` where `mask`; masked entries may be NaN and get zero gradient."""
     return jnp.sum(jnp.where(mask, x, 0), axis=_axes(axis))
 
 
 def masked_mean(
-    x: Float[Array, "*b"], mask: Bool[Array, "*b"], axis: Axis = None, default: float = 0.0
+    x: Float[Array, "*#b"], mask: Bool[Array, "*#b"], axis: Axis = None, default: float = 0.0
 ) -> Float[Array, ...]:
     """Mean of `x` where `mask`, and `default` where nothing is; masked entries may be NaN."""
     count = jnp.sum(mask, axis=_axes(axis), dtype=x.dtype)
@@ -47,7 +47,7 @@ def masked_mean(
 
 
 def masked_max(
-    x: Float[Array, "*b"], mask: Bool[Array, "*b"], axis: Axis = None, default: float = -jnp.inf
+    x: Float[Array, "*#b"], mask: Bool[Array, "*#b"], axis: Axis = None, default: float = -jnp.inf
 ) -> Float[Array, ...]:
     """Maximum of `x` where `mask`, and `default` where nothing is; masked entries may be NaN."""
     found = jnp.max(jnp.where(mask, x, -jnp.inf), axis=_axes(axis))
@@ -55,7 +55,7 @@ def masked_max(
 
 
 def masked_min(
-    x: Float[Array, "*b"], mask: Bool[Array, "*b"], axis: Axis = None, default: float = jnp.inf
+    x: Float[Array, "*#b"], mask: Bool[Array, "*#b"], axis: Axis = None, default: float = jnp.inf
 ) -> Float[Array, ...]:
     """Minimum of `x` where `mask`, and `default` where nothing is; masked entries may be NaN."""
     return -masked_max(-x, mask, axis, -default)

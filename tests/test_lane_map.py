@@ -486,7 +486,10 @@ def test_gradients_equal_finite_differences(host, name):
 def test_gradients_are_finite_everywhere(device, rows):
     """On interval bounds, ends, kinks, the null lane and at the centre of curvature; in float32."""
 
-    def total(lane_map, s, d, row):
+    tables = {name: getattr(device, name) for name in ("rows", "height", "side", "ds", "curvature_max")}
+
+    def total(tables, s, d, row):
+        lane_map = dataclasses.replace(device, **tables)
         x, y, heading = lm.pose(lane_map, row, s, d)
         back = lm.to_frenet(lane_map, row, s, x, y)
         z = lm.elevation(lane_map, row, s)
@@ -494,13 +497,13 @@ def test_gradients_are_finite_everywhere(device, rows):
         speed = lm.turn_speed(lane_map, row, jnp.abs(s))
         return sum(jnp.sum(v) for v in (x, y, heading, *back, *z, *others, speed))
 
-    gradient = jax.jit(jax.grad(total, argnums=(0, 1, 2), allow_int=True))
+    gradient = jax.jit(jax.grad(total, argnums=(0, 1, 2)))
     ends = np.asarray(device.length)
     for row in (*rows.values(), lm.NO_LANE):
         s = jnp.array([-5.0, 0.0, 1.0, 20.0, 20.0005, 28.0, ends[row], ends[row] + 5.0], jnp.float32)
         for d in (0.0, 6.0, -12.0, 1e4):
-            for leaf in jax.tree.leaves(gradient(device, s, jnp.full(s.shape, d), jnp.int32(row))):
-                assert leaf.dtype == jax.dtypes.float0 or np.isfinite(leaf).all(), (row, d)
+            for leaf in jax.tree.leaves(gradient(tables, s, jnp.full(s.shape, d), jnp.int32(row))):
+                assert np.isfinite(leaf).all(), (row, d)
 
 
 def test_project_is_differentiable(device):

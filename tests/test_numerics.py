@@ -7,7 +7,7 @@ import pytest
 
 from limsim_jax import numerics
 
-X = np.array([[3.0, -1.0, np.nan], [0.5, 2.0, 7.0], [1.0, 4.0, -6.0]], np.float32)
+X = np.array([[-3.0, -1.0, np.nan], [0.5, 2.0, 7.0], [1.0, -4.0, 6.0]], np.float32)
 MASK = np.array([[True, True, False], [False, False, False], [True, False, True]])
 
 
@@ -69,6 +69,6 @@ def test_masked_reductions_have_no_gradient_where_masked(reduction):
 
 def test_masked_defaults_replace_only_empty_rows():
     value = numerics.masked_min(jnp.array(X), jnp.array(MASK), axis=1, default=42.0)
-    np.testing.assert_allclose(value, [-1.0, 42.0, -6.0])
+    np.testing.assert_allclose(value, [-3.0, 42.0, 1.0])
     value = numerics.masked_mean(jnp.array(X), jnp.array(MASK), axis=1, default=42.0)
-    np.testing.assert_allclose(value, [1.0, 42.0, -2.5])
+    np.testing.assert_allclose(value, [-2.0, 42.0, 3.5])

@@ -43,8 +43,8 @@ from limsim_jax.numerics import safe_divide, safe_sqrt
 NO_LANE = -1
 """Row of the null lane."""
 
-Index = Int[Array, "*b"] | Int[np.ndarray, "*b"] | int
-Number = Float[Array, "*b"] | Float[np.ndarray, "*b"] | float
+Index = Int[Array, "*#b"] | Int[np.ndarray, "*#b"] | int
+Number = Float[Array, "*#b"] | Float[np.ndarray, "*#b"] | float
 Goals = Sequence[Sequence[str]] | Mapping[str, Sequence[str]]
 
 VEHICLE_CLASSES = ("car", "van", "truck", "bus", "motorcycle", "emergency")
@@ -135,7 +135,7 @@ class LaneMap:
 
 def pose(
     lane_map: LaneMap, lane: Index, s: Number, d: Number = 0.0
-) -> tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
+) -> tuple[Float[Array, "*#b"], Float[Array, "*#b"], Float[Array, "*#b"]]:
     """Position x, y (m) at arc length `s` and lateral offset `d` (m, left > 0), and the lane's heading (rad).
 
     Beyond its ends a lane goes on straight.
@@ -147,20 +147,20 @@ def pose(
     return curve.x0 + (curve.x - d * ty), curve.y0 + (curve.y + d * tx), direction(curve.dx, curve.dy)
 
 
-def curvature(lane_map: LaneMap, lane: Index, s: Number) -> Float[Array, "*b"]:
+def curvature(lane_map: LaneMap, lane: Index, s: Number) -> Float[Array, "*#b"]:
     """Curvature of the centre line, 1/m, positive where it bends left; beyond the ends that of the end."""
     row, u = _locate(lane_map, lane, _as_float(lane_map, s))
     u = _inside(lane_map, row, u)
     return polynomial(_columns(lane_map.rows, row, range(12, 14)), u)
 
 
-def width(lane_map: LaneMap, lane: Index, s: Number) -> Float[Array, "*b"]:
+def width(lane_map: LaneMap, lane: Index, s: Number) -> Float[Array, "*#b"]:
     """Lane width, m; beyond the ends that of the end."""
     row, u = _locate(lane_map, lane, _as_float(lane_map, s))
     return polynomial(_columns(lane_map.rows, row, range(8, 12)), _inside(lane_map, row, u))
 
 
-def elevation(lane_map: LaneMap, lane: Index, s: Number) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+def elevation(lane_map: LaneMap, lane: Index, s: Number) -> tuple[Float[Array, "*#b"], Float[Array, "*#b"]]:
     """Elevation z (m) and grade dz/ds of the centre line; beyond the ends those of the end."""
     row, u = _locate(lane_map, lane, _as_float(lane_map, s))
     u = _inside(lane_map, row, u)
@@ -168,7 +168,7 @@ def elevation(lane_map: LaneMap, lane: Index, s: Number) -> tuple[Float[Array, "
     return polynomial(cubic, u), polynomial(derivative(cubic), u)
 
 
-def neighbor(lane_map: LaneMap, lane: Index, side: Index) -> tuple[Int[Array, "*b"], Bool[Array, "*b"]]:
+def neighbor(lane_map: LaneMap, lane: Index, side: Index) -> tuple[Int[Array, "*#b"], Bool[Array, "*#b"]]:
     """Lane on the left (`side` > 0) or right in the same direction, else NO_LANE; whether one may change."""
     left = jnp.asarray(side) > 0
     return (
@@ -177,7 +177,7 @@ def neighbor(lane_map: LaneMap, lane: Index, side: Index) -> tuple[Int[Array, "*
     )
 
 
-def side_s(lane_map: LaneMap, lane: Index, s: Number, side: Index) -> Float[Array, "*b"]:
+def side_s(lane_map: LaneMap, lane: Index, s: Number, side: Index) -> Float[Array, "*#b"]:
     """Arc length (m) on the left (`side` > 0) or right neighbour, level with `s` on `lane`.
 
     Where there is no neighbour, `s` itself.
@@ -188,7 +188,7 @@ def side_s(lane_map: LaneMap, lane: Index, s: Number, side: Index) -> Float[Arra
     return jnp.where(left, start_l, start_r) + u * jnp.where(left, slope_l, slope_r)
 
 
-def turn_speed(lane_map: LaneMap, lane: Index, lateral_acceleration: Number) -> Float[Array, "*b"]:
+def turn_speed(lane_map: LaneMap, lane: Index, lateral_acceleration: Number) -> Float[Array, "*#b"]:
     """Speed (m/s) at which the tightest bend takes this lateral acceleration (m/s^2), at most the limit.
 
     SUMO limits junctions by 5.5 m/s^2; comfortable driving stays within 2 to 3 m/s^2.
@@ -205,7 +205,7 @@ def to_frenet(
     s_guess: Number,
     x: Number,
     y: Number,
-) -> tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
+) -> tuple[Float[Array, "*#b"], Float[Array, "*#b"], Float[Array, "*#b"]]:
     """Arc length `s`, lateral offset `d` (m, left > 0) of a point, and the lane's heading there (rad).
 
     Finds the foot of the perpendicular nearest to `s_guess`, the last known arc length, by Newton steps
@@ -235,7 +235,7 @@ def project(
     y: Number,
     heading: Number | None = None,
     max_heading: float = math.pi / 2,
-) -> tuple[Int[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
+) -> tuple[Int[Array, "*#b"], Float[Array, "*#b"], Float[Array, "*#b"], Float[Array, "*#b"]]:
     """Nearest lane of a point, and `s`, `d` (m) and the lane's heading (rad) there.
 
     Compares the feet of all perpendiculars on centre lines, and the ends of lanes, within `REACH`; with
@@ -292,25 +292,25 @@ def relative(lane_map: LaneMap, x: Any, y: Any) -> tuple[Any, Any]:
     return np.float32(np.asarray(x, np.float64) - x0), np.float32(np.asarray(y, np.float64) - y0)
 
 
-def _as_float(lane_map: LaneMap, value: Any) -> Float[Array, "*b"]:
+def _as_float(lane_map: LaneMap, value: Any) -> Float[Array, "*#b"]:
     return jnp.asarray(value, lane_map.rows.dtype)
 
 
-def _columns(table: Float[Array, "S W"], row: Int[Array, "*b"], columns: Iterable[int]) -> list[Any]:
+def _columns(table: Float[Array, "S W"], row: Int[Array, "*#b"], columns: Iterable[int]) -> list[Any]:
     # One gather per column: XLA fuses them with the arithmetic; whole rows would go through memory first.
     return [table[row, column] for column in columns]
 
 
 def _locate(
-    lane_map: LaneMap, lane: Index, s: Float[Array, "*b"]
-) -> tuple[Int[Array, "*b"], Float[Array, "*b"]]:
+    lane_map: LaneMap, lane: Index, s: Float[Array, "*#b"]
+) -> tuple[Int[Array, "*#b"], Float[Array, "*#b"]]:
     """Row of the interval that holds `s`, and arc length from its start, m."""
     ds = lane_map.ds[lane]
     index = jnp.clip(jnp.floor(s / ds).astype(jnp.int32), 0, lane_map.count[lane] - 1)
     return lane_map.first[lane] + index, s - index.astype(s.dtype) * ds
 
 
-def _inside(lane_map: LaneMap, row: Int[Array, "*b"], u: Float[Array, "*b"]) -> Float[Array, "*b"]:
+def _inside(lane_map: LaneMap, row: Int[Array, "*#b"], u: Float[Array, "*#b"]) -> Float[Array, "*#b"]:
     # Not jnp.clip: its gradient on the bounds is a half.
     end = lane_map.rows[row, 14]
     return jnp.where(u < 0, 0, jnp.where(u > end, end, u))
@@ -329,7 +329,7 @@ class _Curve(NamedTuple):
     ddy: Any
 
 
-def _curve(lane_map: LaneMap, row: Int[Array, "*b"], u: Float[Array, "*b"]) -> _Curve:
+def _curve(lane_map: LaneMap, row: Int[Array, "*#b"], u: Float[Array, "*#b"]) -> _Curve:
     """Evaluate a row at `u` m from the start of its interval; straight beyond its ends."""
     inside = _inside(lane_map, row, u)
     beyond = u - inside
@@ -345,12 +345,12 @@ def _curve(lane_map: LaneMap, row: Int[Array, "*b"], u: Float[Array, "*b"]) -> _
     return _Curve(x0, y0, x, y, dx, dy, ddx, ddy)
 
 
-def _unit(dx: Float[Array, "*b"], dy: Float[Array, "*b"]) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+def _unit(dx: Float[Array, "*#b"], dy: Float[Array, "*#b"]) -> tuple[Float[Array, "*#b"], Float[Array, "*#b"]]:
     norm = safe_sqrt(dx * dx + dy * dy)
     return safe_divide(dx, norm), safe_divide(dy, norm)
 
 
-def _newton_step(curve: _Curve, x: Number, y: Number) -> Float[Array, "*b"]:
+def _newton_step(curve: _Curve, x: Number, y: Number) -> Float[Array, "*#b"]:
     """Newton step (m) towards the s whose normal passes through the point."""
     ex, ey = (x - curve.x0) - curve.x, (y - curve.y0) - curve.y
     ahead = ex * curve.dx + ey * curve.dy
@@ -361,13 +361,13 @@ def _newton_step(curve: _Curve, x: Number, y: Number) -> Float[Array, "*b"]:
 def _search(
     lane_map: LaneMap,
     lane: Index,
-    s: Float[Array, "*b"],
+    s: Float[Array, "*#b"],
     low: Number,
     high: Number,
     x: Number,
     y: Number,
     steps: int,
-) -> Float[Array, "*b"]:
+) -> Float[Array, "*#b"]:
     """Newton steps for the foot of the perpendicular within [low, high].
 
     Between two places that point at each other (the legs of a kink) a step that leaves them is halved.
