@@ -119,7 +119,7 @@ def draw(
 def check(
     file: MapArgument,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Count what was approximated or ignored as a finding, too.")
+        bool, typer.Option("--strict", help="Count what was approximated, ignored or added, too.")
     ] = False,
     json_file: JsonOption = None,
     no_cache: NoCacheOption = False,
@@ -128,7 +128,7 @@ def check(
 
     Findings are what the reader had to repair, links at which the centre line jumps by more than 1 cm
     or 0.5 degrees, and circles of lanes each of which yields to the next. With --strict, what was
-    approximated or ignored is a finding as well.
+    approximated, ignored or added is a finding as well.
     """
     from limsim_jax.maps import build_lane_map
     from limsim_jax.maps.check import deadlocks, seams
@@ -138,7 +138,7 @@ def check(
     report = copy.deepcopy(network.report)
     build_lane_map(network, report=report, cache=not no_cache)
     broken, circles = list(seams(network)), deadlocks(network)
-    counted = {Action.REPAIRED} | ({Action.APPROXIMATED, Action.IGNORED} if strict else set())
+    counted = {*Action} - {Action.READ} if strict else {Action.REPAIRED}
     findings = len(broken) + len(circles) + sum(report.total(action) for action in counted)
     if json_file is not None:
         _write_json(
@@ -187,7 +187,8 @@ def maps(
     if json_file is not None:
         _write_json(json_file, result)
     if markdown_file is not None:
-        markdown_file.write_text(f"# How fast maps load\n\nMade by `limsim-jax bench maps`.\n\n{tables}\n")
+        command = f"limsim-jax bench maps {file}" + " --all-cores" * all_cores + f" --repeats {repeats}"
+        markdown_file.write_text(f"# How fast maps load\n\nMade by `{command}`.\n\n{tables}\n")
     print(tables)
 
 
