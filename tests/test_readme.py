@@ -2,6 +2,8 @@
 
 import math
 import re
+import subprocess
+import sys
 
 from conftest import REPO
 
@@ -17,6 +19,11 @@ def test_example(capsys):
     assert "laneSection" in capsys.readouterr().out
     assert abs(float(names["s"]) - 25.0) < 1e-3 and abs(float(names["d"]) - 0.5) < 1e-3
     assert math.isclose(float(names["slope"]), math.cos(float(names["heading"])), abs_tol=1e-3)
+
+
+def test_figures_are_those_measured():
+    command = [sys.executable, str(REPO / "experiments" / "readme_tables.py"), "--check"]
+    assert subprocess.run(command).returncode == 0, "run python experiments/readme_tables.py"
 
 
 def test_bundled_maps_are_listed():

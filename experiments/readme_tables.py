@@ -1,0 +1,105 @@
+"""Put the figures of experiments/results/ into the README.
+
+python experiments/readme_tables.py           write them
+python experiments/readme_tables.py --check   fail unless they are there already
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+REPO = Path(__file__).resolve().parents[1]
+
+
+def carla(result: dict[str, Any]) -> str:
+    """The towns of CARLA one by one, all other maps in a sentence."""
+    rows = [
+        "| map | waypoints | host lanes off, mm (max) | device lanes off, mm (median / max) "
+        "| heading off (max) | junctions with equal movements |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    for entry in result["maps"]:
+        figures = entry["figures"]
+        if "town" in entry["map"]:
+            host, device = figures["host"], figures["device"]
+            rows.append(
+                f"| `{entry['map']}` | {figures['waypoints']:,} | {host['max']:.2f} "
+                f"| {device['median']:.3f} / {device['max']:.2f} | {figures['heading_deg']:.3f}° "
+                f"| {figures['junctions_equal']} of {figures['junctions']} |"
+            )
+    judged = [entry for entry in result["maps"] if entry["failure"] is None]
+    waypoints = sum(entry["figures"]["waypoints"] for entry in judged)
+    missed = [f"`{entry['map']}`" for entry in judged if entry["misses"]]
+    missing = f"All thresholds are met but on {', '.join(missed)}." if missed else "All thresholds are met."
+    rows += [
+        "",
+        f"{len(result['maps'])} maps in all; on {len(result['maps']) - len(judged)} CARLA's parser fails. "
+        f"{waypoints:,} waypoints. {missing}",
+    ]
+    return "\n".join(rows)
+
+
+def sumo(result: dict[str, Any]) -> str:
+    """One sentence over all networks."""
+    networks = result["networks"]
+    compared = sum(sum(network["compared"].values()) for network in networks)
+    mismatches = sum(len(network["mismatches"]) for network in networks)
+    return f"{len(networks)} networks, {compared:,} values compared, {mismatches or 'no'} mismatches."
+
+
+def speed(result: dict[str, Any]) -> str:
+    """Times from file to arrays, and look-ups per second at the largest batch."""
+    cold, cached, machine = result["cold"], result["cached"], result["machine"]
+    largest = max(row["batch"] for row in result["look_ups"])
+    rate = {
+        row["function"]: row["look_ups_per_s"] / 1e6 for row in result["look_ups"] if row["batch"] == largest
+    }
+    rows = {
+        "read, rasterised, with all tables": f"{cold['total_s']:.2f} s",
+        "the same from the cache": f"{cached['total_s']:.3f} s",
+        "`pose`: lane coordinates to position and heading": f"{rate['pose']:.1f} million per second",
+        "`to_frenet`: back, from a guess": f"{rate['to_frenet']:.1f} million per second",
+        "`project`: back, anywhere on the map": f"{rate['project']:.2f} million per second",
+    }
+    cores = f"{machine['cores']} core{'' if machine['cores'] == 1 else 's'}"
+    head = [f"| `{result['map']['file']}`, {cores}, {machine['processor']} | |", "|---|---:|"]
+    return "\n".join(head + [f"| {name} | {figure} |" for name, figure in rows.items()])
+
+
+TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
+    "maps_against_carla": carla,
+    "maps_against_sumo": sumo,
+    "maps_speed": speed,
+}
+
+
+def with_tables(text: str) -> str:
+    """The text with the tables of all results between their comments."""
+    for name, table in TABLES.items():
+        result = json.loads((REPO / "experiments" / "results" / f"{name}.json").read_text())
+        begin, end = f"<!-- {name} -->\n", f"\n<!-- end of {name} -->"
+        before, opened, rest = text.partition(begin)
+        _, closed, after = rest.partition(end)
+        if not (opened and closed):
+            raise SystemExit(f"the README has no place for {name}")
+        text = before + begin + table(result) + end + after
+    return text
+
+
+def main() -> int:
+    """Write the README, or compare."""
+    readme = REPO / "README.md"
+    text = readme.read_text()
+    made = with_tables(text)
+    if "--check" in sys.argv[1:]:
+        return 0 if made == text else 1
+    readme.write_text(made)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
