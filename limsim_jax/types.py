@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import enum
 
-import jax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
@@ -81,16 +80,17 @@ class State:
     active: Bool[Array, " N"]
     vehicle: Int[Array, " N"]  # row of the schedule, -1 for vehicles that were there at the start
     lane: Int[Array, " N"]
-    previous: Int[Array, " N"]  # lane behind `lane` on which the tail may still be
+    previous: Int[Array, " N"]  # lane before `lane`, on which the tail may still be
     s: Float[Array, " N"]  # m, front bumper along the lane
     d: Float[Array, " N"]  # m, offset of the vehicle from the centre of the lane, left > 0
     v: Float[Array, " N"]  # m/s
     a: Float[Array, " N"]  # m/s^2, of the last step
     goal: Int[Array, " N"]  # column of the route table
-    # lane change: on the way from (lane, d) to the centre of `target`, or back
-    target: Int[Array, " N"]  # lane to change to, NO_LANE while keeping the lane
-    change_time: Float[Array, " N"]  # s since its start
-    change_from: Float[Array, " N"]  # m, d at its start
+    # lane change: a move of the vehicle's centre from the middle of one lane to the middle of the next
+    side: Int[Array, " N"]  # +1 on the way to the left, -1 to the right, 0 keeping the lane
+    crossed: Bool[Array, " N"]  # `lane` is already the lane that it moves to
+    progress: Float[Array, " N"]  # share of the lane change that is done, 0..1
+    shift: Float[Array, " N"]  # m, offset from the centre of the lane that it moves to, at the start
     rest: Float[Array, " N"]  # s until the next lane change may start
     # junctions
     waiting: Float[Array, " N"]  # s below walking speed
@@ -100,8 +100,3 @@ class State:
     distance: Float[Array, " N"]  # m since it entered
     entered: Float[Array, " N"]  # s, time of entry
     status: Int[Array, " N"]  # bits of `Status`
-
-
-def gather(tree: jax.Array | object, index: Int[Array, "*b"]) -> object:
-    """Rows `index` of every leaf."""
-    return jax.tree.map(lambda x: x[index], tree)

@@ -1,0 +1,160 @@
+"""The traffic engine: look around and decide every so often, move in between.
+
+`decide` looks at the whole world once; everything discrete happens there, for all vehicles from the
+same state. `drive` then integrates `Config.decision_every` physics steps that need no look-ups.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, turn_speed
+from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
+from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, start
+from limsim_jax.traffic.motion import Decision, accelerations, advance
+from limsim_jax.traffic.neighbors import (
+    Ahead,
+    Obstacles,
+    Pair,
+    look_ahead,
+    neighbors,
+    other_lane,
+    sort_vehicles,
+)
+from limsim_jax.types import Config, Driver, Shape, State
+
+_BEND_POINTS = 4  # places ahead on the own lane at which the bend is looked at
+_WALL = 1.0  # m before the end of a lane that leads nowhere
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Behaviour of the vehicles that nobody else controls."""
+
+    model: CarFollowing = field(default_factory=ACC)
+    lane_changes: bool = True
+
+
+class Tick(NamedTuple):
+    """What a physics step hands to whoever records."""
+
+    state: State
+    left: Bool[Array, " N"]  # has left at the end of its goal in this step
+
+
+@jax.named_scope("decide")
+def decide(
+    config: Config, traffic: Traffic, lane_map: LaneMap, driver: Driver, shape: Shape, state: State
+) -> tuple[State, Decision]:
+    """Look around once: leaders, bends, lane changes. Starts lane changes in the state."""
+    order = sort_vehicles(lane_map, state)
+    ahead = look_ahead(config, lane_map, state)
+    v0, v_ahead, distance = _speeds(lane_map, driver, state, ahead)
+    # changes to the left and to the right may start in turns, so nobody enters a gap from both sides
+    side = jnp.where((state.step // config.decision_every) % 2 == 0, 1, -1)
+    beside, beside_s, allowed = place_beside(lane_map, shape, state, side)
+    other, other_s = other_lane(lane_map, state)
+    found = neighbors(
+        config,
+        lane_map,
+        order,
+        shape,
+        state.goal,
+        jnp.stack([jnp.where(state.active, state.lane, NO_LANE), other, beside], -1),
+        jnp.stack([state.s, other_s, beside_s], -1),
+    )
+    own, second, new = (jax.tree.map(lambda x: x[:, k], found) for k in range(3))  # noqa: B023
+    if traffic.lane_changes:
+        choice = choose_lane(
+            traffic.model, lane_map, driver, shape, state, v0, own, new, beside, beside_s, allowed, side
+        )
+        state = start(lane_map, driver, state, choice)
+    else:
+        choice = _stay(state)
+    obstacles = _together(own, second, _lane_end(lane_map, state, ahead))
+    return state, Decision(
+        obstacles=obstacles,
+        v0=v0,
+        v_ahead=v_ahead,
+        ahead=distance,
+        courtesy=choice.letting,
+        courtesy_gap=choice.letting_gap,
+    )
+
+
+def _stay(state: State) -> LaneChoice:
+    zero = jnp.zeros_like(state.side)
+    none = jnp.zeros_like(state.v)
+    return LaneChoice(zero, none, none, zero, zero - 1, none)
+
+
+def _together(own: Pair, second: Pair, wall: Float[Array, " N"]) -> Obstacles:
+    nobody = jnp.full_like(own.lead, -1)
+    return Obstacles(
+        jnp.stack([own.lead, second.lead, nobody], -1),
+        jnp.stack([own.lead_gap, second.lead_gap, wall], -1),
+    )
+
+
+def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N"]:
+    """Metres to where the way ends before the goal: the end of a lane that the route does not leave."""
+    goal = state.goal[:, None]
+    at_goal = lane_map.routes.is_goal[ahead.lane, goal]
+    stuck = (lane_map.routes.next_lane[ahead.lane, goal] == NO_LANE) & ~at_goal & (ahead.lane != NO_LANE)
+    end = ahead.start + lane_map.length[ahead.lane] - _WALL
+    return jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
+
+
+@jax.named_scope("speeds")
+def _speeds(
+    lane_map: LaneMap, driver: Driver, state: State, ahead: Ahead
+) -> tuple[Float[Array, " N"], Float[Array, " N"], Float[Array, " N"]]:
+    """Desired speed here, and the lower speed further on that asks for braking first, and how far it is."""
+    v0 = desired_speed(driver, lane_map.speed_limit[state.lane], curvature(lane_map, state.lane, state.s))
+    # lanes to come: limit and tightest bend
+    lane = ahead.lane[:, 1:]
+    limit = driver.speed_factor[:, None] * lane_map.speed_limit[lane]
+    speed = jnp.minimum(limit, turn_speed(lane_map, lane, driver.a_lat[:, None]))
+    speed = jnp.where(lane == NO_LANE, NO_GAP, speed)
+    # the own lane: its bend at a few places within braking distance
+    reach = state.v * state.v / driver.b + 10.0
+    there = reach[:, None] * (jnp.arange(1, _BEND_POINTS + 1, dtype=reach.dtype) / _BEND_POINTS)
+    bend = jnp.abs(curvature(lane_map, state.lane[:, None], state.s[:, None] + there))
+    own = jnp.sqrt(driver.a_lat[:, None] / jnp.maximum(bend, 1e-6))
+    speed = jnp.concatenate([speed, own], -1)
+    distance = jnp.maximum(jnp.concatenate([ahead.start[:, 1:], there], -1), 0)
+    first = jnp.argmin(speed * speed + driver.b[:, None] * distance, -1)[:, None]
+    pick = lambda x: jnp.take_along_axis(x, first, -1)[:, 0]  # noqa: E731
+    return v0, pick(speed), pick(distance)
+
+
+@jax.named_scope("drive")
+def drive(
+    config: Config,
+    traffic: Traffic,
+    lane_map: LaneMap,
+    driver: Driver,
+    shape: Shape,
+    state: State,
+    record: object = None,
+) -> tuple[State, object]:
+    """One decision and the physics steps up to the next. `record(tick)` is stacked over the steps."""
+    state, decision = decide(config, traffic, lane_map, driver, shape, state)
+
+    def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], object]:
+        state, x = carry
+        a = accelerations(traffic.model, driver, state, decision, x)
+        state, dx, left = advance(config, lane_map, driver, state, a)
+        state = state.replace(step=state.step + 1)  # pyright: ignore[reportAttributeAccessIssue]
+        out = None if record is None else record(Tick(state, left))  # pyright: ignore[reportCallIssue]
+        return (state, x + dx), out
+
+    x = jnp.zeros_like(state.s)
+    (state, _), records = lax.scan(step, (state, x), None, length=config.decision_every)
+    return state, records

@@ -1,0 +1,203 @@
+"""Lane changes: MOBIL for those that pay, urgency for those that the route needs.
+
+Kesting, Treiber, Helbing, Transp. Res. Rec. 1999 (2007) 86: eq. numbers below. Route term and courtesy
+are ours, after the lane-change bias of Treiber & Kesting, Traffic Flow Dynamics (2013), ch. 14.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
+from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
+from limsim_jax.traffic.neighbors import Pair
+from limsim_jax.types import Driver, Shape, State
+
+ROUTE_BASE, ROUTE_URGENT = 0.5, 4.0
+"""m/s^2, incentive for a change that the route needs: at no, and at full urgency."""
+
+SAFE_URGENT = 3.0
+"""m/s^2, added to `b_safe` at full urgency."""
+
+CAUTION = 40.0
+"""m before the last place to change by which a driver wants to be done."""
+
+COURTEOUS = 0.6
+"""Urgency from which the follower on the other lane lets a vehicle in."""
+
+REST = 4.0
+"""s from the end of a lane change to the start of the next voluntary one."""
+
+ROOM = 0.5
+"""m, least gap to the new leader and follower."""
+
+
+class LaneChoice(NamedTuple):
+    """What a vehicle would do about its lane, from the present state alone."""
+
+    side: Int[Array, " N"]  # +1 left, -1 right, 0 stay
+    incentive: Float[Array, " N"]  # m/s^2
+    urgency: Float[Array, " N"]  # 0..1
+    wanted: Int[Array, " N"]  # side that the route needs, 0 if none
+    letting: Int[Array, " N"]  # slot of the vehicle that each one should let in, -1 for none
+    letting_gap: Float[Array, " N"]  # m to it
+
+
+def urgency(
+    lanes_to_go: Int[Array, " N"],
+    room: Float[Array, " N"],
+    v: Float[Array, " N"],
+    lane_change_time: Float[Array, " N"],
+) -> Float[Array, " N"]:
+    """How pressing a change of lanes for the route is, 0 to 1, `room` m before the last place for it."""
+    count = jnp.abs(lanes_to_go).astype(v.dtype)
+    way = count * (v * lane_change_time + 12.0)
+    pressing = jnp.clip((way + CAUTION - room) / jnp.maximum(way, 1.0), 0, 1)
+    return jnp.where(lanes_to_go != 0, pressing, 0)
+
+
+def incentive(
+    *,
+    own_now: Float[Array, " N"],
+    own_then: Float[Array, " N"],
+    new_now: Float[Array, " N"],
+    new_then: Float[Array, " N"],
+    old_now: Float[Array, " N"],
+    old_then: Float[Array, " N"],
+    politeness: Float[Array, " N"],
+) -> Float[Array, " N"]:
+    """Advantage of a lane change, m/s^2 (eq. 7): own, and with politeness that of both followers.
+
+    `now` and `then`: accelerations before and after of the vehicle itself, the follower on the new
+    lane and the one on the old lane. The change pays where it exceeds MOBIL's threshold.
+    """
+    return own_then - own_now + politeness * (new_then - new_now + old_then - old_now)
+
+
+def place_beside(
+    lane_map: LaneMap, shape: Shape, state: State, side: Int[Array, ""]
+) -> tuple[Int[Array, " N"], Float[Array, " N"], Bool[Array, " N"]]:
+    """Lane and s (m) on the side (+1 left, -1 right) of every vehicle, and whether it may change there.
+
+    NO_LANE where it may not: by road marks, in junctions, by vehicle class, in the midst of a change.
+    """
+    left = side > 0
+    lane = jnp.where(left, lane_map.left[state.lane], lane_map.right[state.lane])
+    allowed = jnp.where(left, lane_map.may_change_left[state.lane], lane_map.may_change_right[state.lane])
+    usable = ((lane_map.access[lane] >> shape.vehicle_class) & 1) == 1
+    allowed &= usable & state.active & (state.side == 0) & ~lane_map.is_connector[state.lane]
+    lane = jnp.where(allowed, lane, NO_LANE)
+    return lane, side_s(lane_map, state.lane, state.s, side), allowed
+
+
+@jax.named_scope("choose_lane")
+def choose_lane(
+    model: CarFollowing,
+    lane_map: LaneMap,
+    driver: Driver,
+    shape: Shape,
+    state: State,
+    v0: Float[Array, " N"],
+    own: Pair,
+    pair: Pair,
+    lane: Int[Array, " N"],
+    s: Float[Array, " N"],
+    allowed: Bool[Array, " N"],
+    side: Int[Array, ""],
+) -> LaneChoice:
+    """The lane change to `side` that each vehicle wants and may start now.
+
+    `own` and `pair` are the neighbours on the own lane and on `lane` beside it, level with `s` m. All
+    vehicles choose from the same state. Two that enter the same gap come from the same lane and keep
+    the distance that they have.
+    """
+
+    def follows(i: Int[Array, " N"], gap: Float[Array, " N"], j: Int[Array, " N"]) -> Float[Array, " N"]:
+        """Acceleration of vehicle i behind vehicle j (-1: free road)."""
+        free = j < 0
+        return model(
+            jax.tree.map(lambda x: x[i], driver),
+            gap=jnp.where(free, NO_GAP, gap),
+            v=state.v[i],
+            v_lead=jnp.where(free, state.v[i], state.v[j]),
+            a_lead=jnp.where(free, 0, state.a[j]),
+            v0=v0[i],
+        )
+
+    me = jnp.arange(state.lane.shape[0], dtype=jnp.int32)
+    routes = lane_map.routes
+    to_go = routes.lanes_to_go[state.lane, state.goal]
+    room = routes.change_distance[state.lane, state.goal] - state.s
+    press = urgency(to_go, room, state.v, driver.lane_change_time)
+    wanted = jnp.sign(to_go)
+    reachable = routes.reachable[lane, state.goal]
+
+    own_now = follows(me, own.lead_gap, own.lead)
+    own_then = follows(me, pair.lead_gap, pair.lead)
+    between = pair.lag_gap + shape.length + pair.lead_gap  # from the new follower to the new leader
+    new_now = follows(pair.lag, between, pair.lead)
+    new_then = follows(pair.lag, pair.lag_gap, me)
+    around = own.lag_gap + shape.length + own.lead_gap
+    old_now = follows(own.lag, own.lag_gap, me)
+    old_then = follows(own.lag, around, own.lead)
+    follower, old = pair.lag >= 0, own.lag >= 0
+    advantage = incentive(
+        own_now=own_now,
+        own_then=own_then,
+        new_now=jnp.where(follower, new_now, 0),
+        new_then=jnp.where(follower, new_then, 0),
+        old_now=jnp.where(old, old_now, 0),
+        old_then=jnp.where(old, old_then, 0),
+        politeness=driver.politeness * (1 - press),
+    )
+    with_route = (wanted * side).astype(advantage.dtype)
+    advantage += with_route * jnp.where(wanted != 0, ROUTE_BASE + ROUTE_URGENT * press, 0)
+    advantage -= side.astype(advantage.dtype) * driver.keep_right
+
+    # safety (eq. 2): nobody has to brake harder than b_safe, and there is room
+    b_safe = driver.b_safe + SAFE_URGENT * press
+    safe = (~follower | ((new_then > -b_safe) & (pair.lag_gap > ROOM))) & (
+        (pair.lead < 0) | ((own_then > -b_safe) & (pair.lead_gap > ROOM))
+    )
+    # a change away from the route must leave time to come back, and none is begun that the lane cannot hold
+    away = (wanted * side < 0) | ((wanted == 0) & (routes.lanes_to_go[lane, state.goal] != 0))
+    back = routes.change_distance[lane, state.goal] - s
+    count = jnp.abs(routes.lanes_to_go[lane, state.goal]).astype(back.dtype)
+    late = away & (back < 3 * state.v * driver.lane_change_time * (count + 1))
+    rested = (state.rest <= 0) | (press > 0)
+    starts = allowed & reachable & safe & ~late & rested & (advantage > driver.threshold)
+
+    # courtesy: the vehicle that would be the new follower of somebody in need lets it in
+    asks = (wanted == side) & (press > COURTEOUS) & allowed & follower & ~starts
+    n = me.shape[0]
+    letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(asks, pair.lag, n)].max(me)[:n]
+    letting_gap = jnp.where(letting >= 0, pair.lag_gap[letting], NO_GAP)
+    letting = jnp.where(letting_gap > 0, letting, -1)
+    return LaneChoice(
+        side=jnp.where(starts, side, 0),
+        incentive=advantage,
+        urgency=press,
+        wanted=wanted,
+        letting=letting,
+        letting_gap=letting_gap,
+    )
+
+
+def start(lane_map: LaneMap, driver: Driver, state: State, choice: LaneChoice) -> State:
+    """Begin the lane changes that were chosen."""
+    begins = choice.side != 0
+    beside = jnp.where(choice.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
+    s_beside = side_s(lane_map, state.lane, state.s, choice.side)
+    between = (width(lane_map, state.lane, state.s) + width(lane_map, beside, s_beside)) / 2
+    shift = state.d - choice.side.astype(between.dtype) * between
+    return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        side=jnp.where(begins, choice.side, state.side),
+        crossed=state.crossed & ~begins,
+        progress=jnp.where(begins, 0, state.progress),
+        shift=jnp.where(begins, shift, state.shift),
+        rest=jnp.where(begins, REST + driver.lane_change_time, state.rest),
+    )

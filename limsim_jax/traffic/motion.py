@@ -1,0 +1,187 @@
+"""One physics step: how vehicles move between two decisions.
+
+Nothing is looked up on the map to follow a leader: the decision left a gap to every obstacle, and the
+gap now is that gap plus what the obstacle has travelled since, less what the vehicle itself has.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, width
+from limsim_jax.numerics import safe_divide
+from limsim_jax.traffic.car_following import NO_GAP, CarFollowing, ballistic, per_obstacle
+from limsim_jax.traffic.neighbors import Obstacles
+from limsim_jax.types import Config, Driver, Shape, State, Status
+
+WALKING_SPEED = 1.5
+"""m/s, below which a vehicle counts as waiting."""
+
+CREEP_SPEED = 5.0
+"""m/s, below which a lane change goes on by distance, not by time: what stands does not slide."""
+
+_HAND_OVERS = 3  # lanes that a vehicle may leave behind in one step
+_APPROACH = 0.7  # of the comfortable deceleration: used to slow down for a bend ahead
+
+
+class Decision(NamedTuple):
+    """What drivers have decided until the next decision."""
+
+    obstacles: Obstacles
+    v0: Float[Array, " N"]  # m/s, desired speed here
+    v_ahead: Float[Array, " N"]  # m/s, lower speed needed further on
+    ahead: Float[Array, " N"]  # m to there, at the decision
+    courtesy: Int[Array, " N"]  # slot of a vehicle that is let in, -1 for none
+    courtesy_gap: Float[Array, " N"]  # m to it, at the decision
+
+
+COURTESY = 2.0
+"""m/s^2, the hardest braking to let somebody in."""
+
+
+@jax.named_scope("accelerations")
+def accelerations(
+    model: CarFollowing, driver: Driver, state: State, decision: Decision, x: Float[Array, " N"]
+) -> Float[Array, " N"]:
+    """Acceleration (m/s^2) of every vehicle, `x` m after the decision: the least that any obstacle asks."""
+    index, gap0 = decision.obstacles
+    moving = index >= 0
+
+    def seen(index: Int[Array, "*b"], value: Float[Array, " N"]) -> Float[Array, "*b"]:
+        return jnp.where(index >= 0, value[index], 0)
+
+    none = gap0 >= NO_GAP
+    gap = jnp.where(none, NO_GAP, gap0 + seen(index, x) - x[:, None])
+    v_lead = jnp.where(none, state.v[:, None], seen(index, state.v))
+    a_lead = jnp.where(moving, seen(index, state.a), 0)
+    # slow down in time for what comes: the speed from which `v_ahead` is reached with a part of b
+    room = jnp.maximum(decision.ahead - x, 0)
+    reach = jnp.sqrt(decision.v_ahead**2 + 2 * _APPROACH * driver.b * room + 1e-6)
+    v0 = jnp.minimum(decision.v0, reach)
+    a = model(
+        per_obstacle(driver), gap=gap, v=state.v[:, None], v_lead=v_lead, a_lead=a_lead, v0=v0[:, None]
+    ).min(-1)
+    polite = decision.courtesy >= 0
+    gap = jnp.where(polite, decision.courtesy_gap + seen(decision.courtesy, x) - x, NO_GAP)
+    v_lead = jnp.where(polite, seen(decision.courtesy, state.v), state.v)
+    kind = model(driver, gap=gap, v=state.v, v_lead=v_lead, a_lead=jnp.zeros_like(a), v0=v0)
+    return jnp.minimum(a, jnp.maximum(kind, -COURTESY))
+
+
+@jax.named_scope("advance")
+def advance(
+    config: Config,
+    lane_map: LaneMap,
+    driver: Driver,
+    state: State,
+    a: Float[Array, " N"],
+) -> tuple[State, Float[Array, " N"], Bool[Array, " N"]]:
+    """Move all vehicles one step with acceleration `a` (m/s^2).
+
+    Returns the state, the distance that each travelled (m), and who has left at the end of its goal.
+    """
+    a = jnp.where(state.active, a, 0)
+    v, dx = ballistic(state.v, a, config.dt)
+    realised = (v - state.v) / config.dt
+    hard = realised < -driver.b_max - 0.01
+    lane, previous, s, left = _hand_over(lane_map, state, state.s + dx)
+    state = state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        step=state.step,
+        lane=jnp.where(left, NO_LANE, lane),
+        previous=jnp.where(left, NO_LANE, previous),
+        s=jnp.where(left, 0, s),
+        v=jnp.where(left, 0, v),
+        a=jnp.where(left, 0, realised),
+        active=state.active & ~left,
+        distance=state.distance + dx,
+        waiting=jnp.where(state.active & (v < WALKING_SPEED), state.waiting + config.dt, 0),
+        rest=jnp.maximum(state.rest - config.dt, 0),
+        status=state.status | jnp.where(hard & state.active, int(Status.HARD_BRAKE), 0),
+    )
+    return _move_sideways(config, lane_map, driver, state), dx, left
+
+
+def _hand_over(
+    lane_map: LaneMap, state: State, s: Float[Array, " N"]
+) -> tuple[Int[Array, " N"], Int[Array, " N"], Float[Array, " N"], Bool[Array, " N"]]:
+    """Pass vehicles beyond the end of their lane on to the next one of their route."""
+    lane, previous = state.lane, state.previous
+    left = jnp.zeros_like(state.active)
+    for _ in range(_HAND_OVERS):
+        length = lane_map.length[lane]
+        over = state.active & (s > length) & ~left
+        following = lane_map.routes.next_lane[lane, state.goal]
+        gone = over & lane_map.routes.is_goal[lane, state.goal]
+        go_on = over & ~gone & (following != NO_LANE)
+        left = left | gone
+        previous = jnp.where(go_on, lane, previous)
+        s = jnp.where(go_on, s - length, s)
+        lane = jnp.where(go_on, following, lane)
+    return lane, previous, s, left
+
+
+def smooth_step(u: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """The quintic from 0 to 1 with zero first and second derivative at both ends."""
+    u = jnp.clip(u, 0, 1)
+    return u * u * u * (10 + u * (-15 + 6 * u))
+
+
+@jax.named_scope("lane_change_motion")
+def _move_sideways(config: Config, lane_map: LaneMap, driver: Driver, state: State) -> State:
+    """Go on with lane changes: d follows a quintic, and half-way the lane is the other one."""
+    changing = state.active & (state.side != 0)
+    rate = jnp.minimum(state.v / CREEP_SPEED, 1)
+    done = state.progress + rate * safe_divide(jnp.full_like(rate, config.dt), driver.lane_change_time)
+    progress = jnp.where(changing, jnp.minimum(done, 1), 0)
+    offset = state.shift * (1 - smooth_step(progress))  # from the centre of the lane that it moves to
+    beside = jnp.where(state.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
+    s_beside = side_s(lane_map, state.lane, state.s, state.side)
+    own_width = width(lane_map, state.lane, state.s)
+    between = jnp.where(
+        beside == NO_LANE, own_width, (own_width + width(lane_map, beside, s_beside)) / 2
+    )  # m from centre to centre
+    side = state.side.astype(offset.dtype)
+    d = jnp.where(state.crossed, offset, offset + side * between)
+    crosses = changing & ~state.crossed & (side * d > own_width / 2) & (beside != NO_LANE)
+    finished = changing & (progress >= 1) & (state.crossed | crosses)
+    return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        lane=jnp.where(crosses, beside, state.lane),
+        previous=jnp.where(
+            crosses,
+            jnp.where(state.side > 0, lane_map.left[state.previous], lane_map.right[state.previous]),
+            state.previous,
+        ),
+        s=jnp.where(crosses, s_beside, state.s),
+        d=jnp.where(changing & ~finished, jnp.where(crosses, d - side * between, d), 0),
+        side=jnp.where(finished, 0, state.side),
+        crossed=(state.crossed | crosses) & changing & ~finished,
+        progress=jnp.where(finished, 0, progress),
+        shift=jnp.where(finished, 0, state.shift),
+    )
+
+
+def lateral_speed(driver: Driver, state: State) -> Float[Array, " N"]:
+    """Speed across the lane, m/s, of vehicles that change lanes."""
+    u = jnp.clip(state.progress, 0, 1)
+    slope = 30 * u * u * (1 - u) * (1 - u)
+    rate = safe_divide(jnp.minimum(state.v / CREEP_SPEED, 1), driver.lane_change_time)
+    return jnp.where(state.side != 0, -state.shift * slope * rate, 0)
+
+
+def boxes(lane_map: LaneMap, driver: Driver, shape: Shape, state: State) -> Float[Array, "N 5"]:
+    """Oriented boxes: x, y (m) of the centre, heading (rad), length, width (m).
+
+    The body lies on the lane at its centre, half a length behind the front bumper, which may be on the
+    lane before; it is turned by the direction of its motion.
+    """
+    s = state.s - shape.length / 2
+    behind = (s < 0) & (state.previous != NO_LANE)
+    lane = jnp.where(behind, state.previous, state.lane)
+    s = jnp.where(behind, s + lane_map.length[state.previous], s)
+    x, y, heading = pose(lane_map, lane, s, state.d)
+    turned = jnp.arctan2(lateral_speed(driver, state), jnp.maximum(state.v, 0.5))
+    return jnp.stack([x, y, heading + turned, shape.length, shape.width], -1)

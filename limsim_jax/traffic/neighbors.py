@@ -1,0 +1,179 @@
+"""Who drives ahead and behind, on the own lane and beside it, across lane ends along the route.
+
+One sort per decision puts all vehicles in order of (lane, s); every query is then a binary search.
+A vehicle that changes lanes stands in the order twice, once on each lane.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s
+from limsim_jax.types import Config, Shape, State
+
+ABSENT = 1e6
+"""Gap (m) to a neighbour that is not there: far, but finite, so that gradients stay finite."""
+
+_POSITION_BITS = 18  # of a sort key: positions on a lane to 1 / 2^18 of its length
+_UPSTREAM = 2  # predecessors of a lane that are searched for followers
+
+
+class Ahead(NamedTuple):
+    """The lanes that a vehicle will drive on: its own and those after it; NO_LANE where the way ends."""
+
+    lane: Int[Array, "N D"]
+    start: Float[Array, "N D"]  # m from the front bumper to the start of the lane; negative for the own one
+
+
+class Obstacles(NamedTuple):
+    """What a vehicle must not run into: `K` others or standing obstacles, gaps at the decision."""
+
+    other: Int[Array, "N K"]  # slot of the other vehicle, -1 for a standing obstacle
+    gap: Float[Array, "N K"]  # m, bumper to bumper; ABSENT if there is none
+
+
+class Pair(NamedTuple):
+    """Leader and follower of every vehicle at a place on some lane."""
+
+    lead: Int[Array, "*b"]  # slot, -1 if there is none
+    lead_gap: Float[Array, "*b"]  # m from the own front to the rear of the leader
+    lag: Int[Array, "*b"]
+    lag_gap: Float[Array, "*b"]  # m from the front of the follower to the own rear
+
+
+class Order(NamedTuple):
+    """Vehicles in order of lane and position, `E` = 2N entries; those of no lane last."""
+
+    key: Int[Array, " E"]
+    vehicle: Int[Array, " E"]  # slot
+    lane: Int[Array, " E"]
+    s: Float[Array, " E"]  # m, front bumper
+
+
+@jax.named_scope("look_ahead")
+def look_ahead(config: Config, lane_map: LaneMap, state: State) -> Ahead:
+    """Follow the route of every vehicle over `config.look_ahead_lanes` lanes beyond its own."""
+    lanes, starts = [state.lane], [-state.s]
+    for _ in range(config.look_ahead_lanes):
+        starts.append(starts[-1] + lane_map.length[lanes[-1]])
+        lanes.append(lane_map.routes.next_lane[lanes[-1], state.goal])
+    return Ahead(jnp.stack(lanes, -1), jnp.stack(starts, -1))
+
+
+@jax.named_scope("sort_vehicles")
+def sort_vehicles(lane_map: LaneMap, state: State) -> Order:
+    """Put all active vehicles in order; those that change lanes also on the lane they change to."""
+    other, other_s = other_lane(lane_map, state)
+    lane = jnp.concatenate([jnp.where(state.active, state.lane, NO_LANE), other])
+    s = jnp.concatenate([state.s, other_s])
+    slot = jnp.arange(state.lane.shape[0], dtype=jnp.int32)
+    vehicle = jnp.concatenate([slot, slot])
+    key, vehicle, lane, s = lax.sort((_key(lane_map, lane, s), vehicle, lane, s), num_keys=1)
+    return Order(key, vehicle, lane, s)
+
+
+def other_lane(lane_map: LaneMap, state: State) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
+    """The second lane that a vehicle which changes lanes is on, else NO_LANE, and its s there (m)."""
+    side = jnp.where(state.crossed, -state.side, state.side)
+    lane = jnp.where(side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
+    lane = jnp.where(state.active & (side != 0), lane, NO_LANE)
+    return lane, side_s(lane_map, state.lane, state.s, side)
+
+
+def _key(lane_map: LaneMap, lane: Int[Array, "*b"], s: Float[Array, "*b"]) -> Int[Array, "*b"]:
+    """Sort key: lane in the high bits, position in the low ones; lanes of -1 come last."""
+    part = jnp.clip(s / lane_map.length[lane], 0.0, 1.0) * (2**_POSITION_BITS - 1)
+    row = jnp.where(lane == NO_LANE, lane_map.length.shape[0], lane).astype(jnp.uint32)
+    return (row << _POSITION_BITS) | part.astype(jnp.uint32)
+
+
+def _find(order: Order, key: Int[Array, "*b"], side: str) -> Int[Array, "*b"]:
+    return jnp.searchsorted(order.key, key, side=side, method="scan_unrolled").astype(jnp.int32)
+
+
+def _entry(
+    order: Order, position: Int[Array, "*b"], lane: Int[Array, "*b"]
+) -> tuple[Int[Array, "*b"], Float[Array, "*b"]]:
+    """Vehicle and s of the entry at `position`; vehicle -1 if there is none there on `lane`."""
+    last = order.key.shape[0] - 1
+    place = jnp.clip(position, 0, last)
+    there = (position >= 0) & (position <= last) & (order.lane[place] == lane) & (lane != NO_LANE)
+    return jnp.where(there, order.vehicle[place], -1), order.s[place]
+
+
+@jax.named_scope("neighbors")
+def neighbors(
+    config: Config,
+    lane_map: LaneMap,
+    order: Order,
+    shape: Shape,
+    goal: Int[Array, " N"],
+    lane: Int[Array, "N K"],
+    s: Float[Array, "N K"],
+) -> Pair:
+    """Leaders and followers of every vehicle as if it stood at `s` (m) of `lane`, for K places each.
+
+    The leader is looked for along the route from there, within `config.look_ahead`; the follower on the
+    lane, else on the last stretch of two of its predecessors. The vehicle itself does not count.
+    Without a lane there is nobody.
+    """
+    me = jnp.arange(lane.shape[0], dtype=jnp.int32)[:, None]
+    goal = jnp.broadcast_to(goal[:, None], lane.shape)
+
+    # three binary searches at once: the place itself, the start of the lanes ahead, the end of those behind
+    lanes, starts = [], []
+    start, after = lane_map.length[lane] - s, lane
+    for _ in range(config.look_ahead_lanes):
+        after = lane_map.routes.next_lane[after, goal]
+        lanes.append(after)
+        starts.append(start)
+        start = start + lane_map.length[after]
+    ahead, offset = jnp.stack(lanes, -1), jnp.stack(starts, -1)  # [N, K, D]
+    behind = lane_map.predecessors[lane][..., :_UPSTREAM]  # [N, K, P]
+    size = lane_map.length.shape[0]
+    beyond = jnp.where(behind == NO_LANE, size, behind + 1)  # the first lane after it in the order
+    here = _find(order, _key(lane_map, lane, s), "right")
+    edge = jnp.concatenate([jnp.where(ahead == NO_LANE, size, ahead), beyond], -1).astype(jnp.uint32)
+    found = _find(order, edge << _POSITION_BITS, "left")
+    first, last = found[..., : config.look_ahead_lanes], found[..., config.look_ahead_lanes :] - 1
+
+    # leader: the next entry that is not oneself, else the last vehicle of the lanes that follow
+    vehicle, position = _entry(order, here, lane)
+    vehicle2, position2 = _entry(order, here + 1, lane)
+    skip = vehicle == me
+    lead, lead_at = jnp.where(skip, vehicle2, vehicle), jnp.where(skip, position2, position) - s
+    vehicle, position = _entry(order, first, ahead)
+    vehicle2, position2 = _entry(order, first + 1, ahead)
+    skip = vehicle == me[..., None]
+    vehicle, position = jnp.where(skip, vehicle2, vehicle), jnp.where(skip, position2, position)
+    for k in range(config.look_ahead_lanes):
+        new = (lead < 0) & (vehicle[..., k] >= 0)
+        lead = jnp.where(new, vehicle[..., k], lead)
+        lead_at = jnp.where(new, offset[..., k] + position[..., k], lead_at)
+    lead_gap = lead_at - shape.length[lead]
+    lead = jnp.where(lead_gap < config.look_ahead, lead, -1)
+
+    # follower: the entry before, else the first vehicle on a lane that leads here
+    vehicle, position = _entry(order, here - 1, lane)
+    vehicle2, position2 = _entry(order, here - 2, lane)
+    skip = vehicle == me
+    lag, lag_at = jnp.where(skip, vehicle2, vehicle), s - jnp.where(skip, position2, position)
+    vehicle, position = _entry(order, last, behind)
+    vehicle = jnp.where(vehicle == me[..., None], -1, vehicle)
+    distance = s[..., None] + lane_map.length[behind] - position
+    distance = jnp.where(vehicle >= 0, distance, ABSENT)
+    nearest = jnp.argmin(distance, -1)[..., None]
+    upstream = (lag < 0) & (lane != NO_LANE)
+    lag = jnp.where(upstream, jnp.take_along_axis(vehicle, nearest, -1)[..., 0], lag)
+    lag_at = jnp.where(upstream, jnp.take_along_axis(distance, nearest, -1)[..., 0], lag_at)
+    return Pair(
+        lead,
+        jnp.where(lead >= 0, lead_gap, ABSENT),
+        lag,
+        jnp.where(lag >= 0, lag_at - shape.length[:, None], ABSENT),
+    )

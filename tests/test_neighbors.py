@@ -1,0 +1,104 @@
+"""Neighbours against a loop over all vehicles in plain Python."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from traffic_worlds import bundled, scattered, shapes, state_of
+
+from limsim_jax.maps.lane_map import NO_LANE
+from limsim_jax.traffic.neighbors import ABSENT, neighbors, other_lane, sort_vehicles
+from limsim_jax.types import Config
+
+CONFIG = Config(dt=0.1)
+
+
+def by_loop(lane_map, state, shape, lane, s, config=CONFIG):
+    """Leader and follower of each vehicle at (lane, s): every pair is looked at."""
+    length = np.asarray(lane_map.length)
+    next_lane, before = np.asarray(lane_map.routes.next_lane), np.asarray(lane_map.predecessors)
+    other, other_s = (np.asarray(x) for x in other_lane(lane_map, state))
+    entries = []
+    for j in range(len(lane)):
+        if state.active[j]:
+            entries.append((j, int(state.lane[j]), float(state.s[j])))
+            if other[j] != NO_LANE:
+                entries.append((j, int(other[j]), float(other_s[j])))
+    result = []
+    for i in range(len(lane)):
+        lead, lead_gap, lag, lag_gap = -1, ABSENT, -1, ABSENT
+        if lane[i] != NO_LANE:
+            here, start = int(lane[i]), -float(s[i])
+            for depth in range(config.look_ahead_lanes + 1):
+                if here == NO_LANE:
+                    break
+                found = [
+                    (start + at, j) for j, on, at in entries if on == here and j != i and (depth or at > s[i])
+                ]
+                if found:
+                    distance, j = min(found)
+                    gap = distance - float(shape.length[j])
+                    if gap < config.look_ahead:
+                        lead, lead_gap = j, gap
+                    break
+                start += length[here]
+                here = int(next_lane[here, int(state.goal[i])])
+            found = [(s[i] - at, j) for j, on, at in entries if on == lane[i] and j != i and at <= s[i]]
+            if not found:  # the first one on each of two lanes before, the nearer of them
+                for b in before[lane[i]][:2]:
+                    queue = [(at, j) for j, on, at in entries if on == b and b != NO_LANE]
+                    if queue and max(queue)[1] != i:
+                        found.append((s[i] + length[b] - max(queue)[0], max(queue)[1]))
+            if found:
+                distance, lag = min(found)
+                lag_gap = distance - float(shape.length[i])
+        result.append((lead, lead_gap, lag, lag_gap))
+    return [np.array(column) for column in zip(*result, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("name", "n"), [("highway", 60), ("ramp", 80), ("roundabout", 40), ("intersection", 60)]
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_neighbors_are_those_of_the_loop(name, n, seed):
+    _, lane_map = bundled(name)
+    state = scattered(name, n, seed)
+    rng = np.random.default_rng(seed)
+    # unequal lengths, some slots empty, some vehicles in the midst of a lane change
+    shape = shapes(n).replace(length=jnp.asarray(rng.uniform(3, 9, n), jnp.float32))
+    side = rng.integers(-1, 2, n)
+    state = state.replace(
+        active=jnp.asarray(rng.random(n) < 0.9),
+        side=jnp.asarray(side, jnp.int32),
+        crossed=jnp.asarray(rng.random(n) < 0.5) & (jnp.asarray(side) != 0),
+    )
+    left = np.asarray(lane_map.left)[np.asarray(state.lane)]
+    lane = np.stack([np.where(state.active, state.lane, NO_LANE), left], -1)
+    s = np.stack([state.s, state.s], -1)
+
+    @jax.jit
+    def query(state, shape, lane, s):
+        order = sort_vehicles(lane_map, state)
+        return neighbors(CONFIG, lane_map, order, shape, state.goal, lane, s)
+
+    pair = query(state, shape, jnp.asarray(lane), jnp.asarray(s))
+    found_any = 0
+    for k in range(2):
+        lead, lead_gap, lag, lag_gap = by_loop(lane_map, state, shape, lane[:, k], np.asarray(s[:, k]))
+        np.testing.assert_array_equal(np.asarray(pair.lead[:, k]), lead)
+        np.testing.assert_allclose(np.asarray(pair.lead_gap[:, k]), lead_gap, atol=5e-3)
+        np.testing.assert_array_equal(np.asarray(pair.lag[:, k]), lag)
+        np.testing.assert_allclose(np.asarray(pair.lag_gap[:, k]), lag_gap, atol=5e-3)
+        found_any += (lead >= 0).sum() + (lag >= 0).sum()
+    assert found_any > n  # the comparison is about something
+
+
+def test_nobody_sees_empty_slots_or_itself():
+    _, lane_map = bundled("highway")
+    goal = int(np.nonzero(np.asarray(lane_map.routes.reachable)[0])[0][0])
+    state = state_of([0, 0, 0], [100.0, 130.0, 160.0], [10.0] * 3, [goal] * 3, active=[True, False, True])
+    order = sort_vehicles(lane_map, state)
+    pair = neighbors(CONFIG, lane_map, order, shapes(3), state.goal, state.lane[:, None], state.s[:, None])
+    assert pair.lead[:, 0].tolist()[::2] == [2, -1]
+    assert pair.lag[:, 0].tolist()[::2] == [-1, 0]
+    assert float(pair.lead_gap[0, 0]) == 55.0 and float(pair.lag_gap[2, 0]) == 55.0

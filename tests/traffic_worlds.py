@@ -1,0 +1,74 @@
+"""Worlds for tests of the engine: maps, drivers, and vehicles placed at random."""
+
+from __future__ import annotations
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+
+from limsim_jax.maps import build_lane_map, bundled_map, load_map
+from limsim_jax.maps.lane_map import LaneMap, lane_rows
+from limsim_jax.maps.network import Network
+from limsim_jax.types import Driver, Shape, State
+
+
+@functools.cache
+def bundled(name: str) -> tuple[Network, LaneMap]:
+    """A bundled map and its lane map."""
+    network = load_map(bundled_map(name), cache=False)
+    return network, build_lane_map(network)
+
+
+def drivers(n: int, **changes: float) -> Driver:
+    """Equal drivers."""
+    values = {
+        "speed_factor": 1.0, "v_max": 60.0, "T": 1.2, "s0": 2.0, "a": 1.5, "b": 2.0, "delta": 4.0,
+        "b_max": 8.0, "coolness": 0.99, "politeness": 0.2, "threshold": 0.15, "b_safe": 3.0,
+        "keep_right": 0.0, "lane_change_time": 4.5, "a_lat": 2.5, "gap_factor": 1.0, "svo": 0.0,
+    } | changes  # fmt: skip
+    return Driver(**{name: jnp.full(n, value, jnp.float32) for name, value in values.items()})
+
+
+def shapes(n: int, length: float = 5.0) -> Shape:
+    """Equal cars."""
+    return Shape(
+        length=jnp.full(n, length, jnp.float32),
+        width=jnp.full(n, 1.9, jnp.float32),
+        wheelbase=jnp.full(n, 2.8, jnp.float32),
+        vehicle_class=jnp.zeros(n, jnp.int32),
+    )
+
+
+def state_of(lane, s, v, goal, active=None) -> State:
+    """Vehicles that keep their lanes."""
+    n = len(lane)
+    zero, zeros = jnp.zeros(n, jnp.float32), jnp.zeros(n, jnp.int32)
+    off = jnp.zeros(n, bool)
+    return State(
+        step=jnp.int32(0), active=jnp.ones(n, bool) if active is None else jnp.asarray(active),
+        vehicle=zeros - 1, lane=jnp.asarray(lane, jnp.int32), previous=zeros - 1,
+        s=jnp.asarray(s, jnp.float32), d=zero, v=jnp.asarray(v, jnp.float32), a=zero,
+        goal=jnp.asarray(goal, jnp.int32), side=zeros, crossed=off, progress=zero, shift=zero, rest=zero,
+        waiting=zero, held=off, stopped=off, distance=zero, entered=zero, status=zeros,
+    )  # fmt: skip
+
+
+def scattered(name: str, n: int, seed: int, spacing: float = 30.0, v: float = 15.0) -> State:
+    """`n` vehicles at random seats `spacing` m apart on the lanes of a map, each with a goal it can reach."""
+    network, lane_map = bundled(name)
+    rng = np.random.default_rng(seed)
+    rows = lane_rows(network)
+    seats = [
+        (row, s)
+        for lane, row in rows.items()
+        if network.lanes[lane].junction is None
+        for s in np.arange(12.0, network.lanes[lane].length - 6.0, spacing)
+    ]
+    reachable = np.asarray(lane_map.routes.reachable)
+    pick = [seats[i] for i in rng.permutation(len(seats))[:n]]
+    goal = [rng.choice(np.nonzero(reachable[row])[0]) for row, _ in pick]
+    jitter = rng.uniform(-5.0, 5.0, len(pick))
+    return state_of(
+        [row for row, _ in pick], np.array([s for _, s in pick]) + jitter, np.full(len(pick), v), goal
+    )
