@@ -186,6 +186,17 @@ def test_clothoid_against_fresnel_integrals():
     np.testing.assert_allclose(curvature, bend * s / length, rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.parametrize("reverse", [False, True])
+def test_curvature_jumps_where_the_lane_does_though_a_sample_has_one_value(reverse):
+    line = Line((40.0, 0.02, 0.02), (40.0, 0.0, 0.0), (40.0, -0.01, -0.01), step=8.0)
+    lane = line.lane("a", reverse=reverse)
+    lane_map = lm.build_lane_map(network(lane))
+    s = np.array([1.0, 20.0, 38.0, 42.0, 60.0, 78.0, 82.0, 100.0, 119.0])
+    truth = np.repeat([0.02, 0.0, -0.01], 3)
+    s, truth = (120 - s, -truth) if reverse else (s, truth)
+    np.testing.assert_allclose(lm.curvature(lane_map, 0, jnp.asarray(s, jnp.float32)), truth, atol=1e-6)
+
+
 def test_lateral_offset_is_to_the_left():
     lane_map = lm.build_lane_map(network(Line((40.0, 0.0, 0.0), heading=np.pi / 2).lane("north")))
     x, y, heading = pose(lane_map, 0, jnp.float32(10), jnp.float32(2))
@@ -504,6 +515,27 @@ def test_gradients_are_finite_everywhere(device, rows):
         for d in (0.0, 6.0, -12.0, 1e4):
             for leaf in jax.tree.leaves(gradient(tables, s, jnp.full(s.shape, d), jnp.int32(row))):
                 assert np.isfinite(leaf).all(), (row, d)
+
+
+def test_gradients_are_finite_where_a_lane_turns_on_the_spot(device):
+    """There the tangent vanishes: rows that stand still stand in for it."""
+    still = dataclasses.replace(device, rows=device.rows.at[:, 1:4].set(0).at[:, 5:8].set(0))
+
+    def total(rows, s, d):
+        lane_map = dataclasses.replace(still, rows=rows)
+        return sum(jnp.sum(v) for v in (*lm.pose(lane_map, 0, s, d), *lm.to_frenet(lane_map, 0, s, d, d)))
+
+    for leaf in jax.jit(jax.grad(total, argnums=(0, 1, 2)))(still.rows, jnp.float32(5), jnp.float32(1)):
+        assert np.isfinite(leaf).all()
+
+
+def test_gradients_on_interval_bounds_are_those_of_one_side():
+    """Not half of them, as a clip has on its bounds."""
+    radius = 50.0
+    lane_map = lm.build_lane_map(network(Line((40.0, 1 / radius, 1 / radius)).lane("a")))
+    bounds = jnp.arange(0, 40, float(lane_map.ds[0]))
+    turn = jax.vmap(jax.grad(lambda s: lm.pose(lane_map, 0, s)[2]))(bounds)
+    np.testing.assert_allclose(turn, 1 / radius, rtol=0.02)
 
 
 def test_project_is_differentiable(device):
