@@ -17,7 +17,8 @@ from jaxtyping import install_import_hook  # noqa: E402
 # Shapes and types of these modules are checked in every call. Only modules of functions: the pytrees
 # that JAX rebuilds with placeholders inside would not pass.
 typecheck = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float
-_hooked = [f"limsim_jax.maps.{name}" for name in ("conflicts", "routing", "signals")]
+_hooked = ["limsim_jax.numerics", "limsim_jax.geometry"]
+_hooked += [f"limsim_jax.maps.{name}" for name in ("conflicts", "routing", "signals")]
 install_import_hook(_hooked, "conftest.typecheck")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
