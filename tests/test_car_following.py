@@ -179,6 +179,7 @@ def test_overlap_and_rest(model):
     """Where bodies overlap it brakes as hard as it can, and nobody leaves a standing queue too near."""
     driver = make_driver()
     assert accelerate(model, driver, -1.0, 5.0, 5.0, 0.0, 10.0) == -9.0
+    assert accelerate(model, make_driver(s0=0.0), 0.0, 0.0, 0.0, 0.0, 10.0) == -9.0
     assert accelerate(model, driver, 1.9, 0.0, 0.0, 0.0, 10.0) < 0
     assert accelerate(model, driver, 2.1, 0.0, 0.0, 0.0, 10.0) > 0
 

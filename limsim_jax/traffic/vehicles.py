@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax.scipy.special import ndtr, ndtri
+from jax.lax import erf, erf_inv
 from jaxtyping import Array, Float, Int, Key
 
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES
@@ -63,12 +63,14 @@ def sample(
       key: of this vehicle, and of nothing else; is consumed.
       vehicle_type: row of the population; drawn by `share` if not given.
     """
-    type_key, latent_key, own_key = jax.random.split(key, 3)
+    # One call of the generator: each costs compilation time.
+    draws = jax.random.normal(key, (3 + len(PARAMETERS),))
+    chance, latent, own = draws[0], draws[1:3], draws[3:]
     if vehicle_type is None:
         total = jnp.cumsum(population.share)
-        draw = jax.random.uniform(type_key) * total[-1]
-        # Some vehicle of the last type that has a share, should rounding take `draw` to the end.
-        vehicle_type = jnp.argmax((draw < total) | (total == total[-1])).astype(jnp.int32)
+        threshold = _probability(chance) * total[-1]
+        # Some vehicle of the last type that has a share, should rounding take `threshold` to the end.
+        vehicle_type = jnp.argmax((threshold < total) | (total == total[-1])).astype(jnp.int32)
     median, spread, loading, lower, upper = (
         leaf[vehicle_type]
         for leaf in (
@@ -79,18 +81,17 @@ def sample(
             population.upper,
         )
     )
-    latent = jax.random.normal(latent_key, (2,))[_LATENT]
-    own = jax.random.normal(own_key, median.shape)
-    score = loading * latent + jnp.sqrt(1 - loading * loading) * own
+    score = loading * latent[_LATENT] + jnp.sqrt(1 - loading * loading) * own
 
     def scale(x: Array) -> Array:
         return jnp.where(_IS_NORMAL, x, jnp.log(jnp.maximum(x, 1e-30)))
 
     # Truncation by the inverse distribution function: no redrawing, and no heap at the bounds.
     width = jnp.where(spread > 0, spread, 1)
-    low, high = ndtr((scale(lower) - scale(median)) / width), ndtr((scale(upper) - scale(median)) / width)
-    quantile = jnp.clip(low + (high - low) * ndtr(score), 1e-7, 1 - 1e-7)
-    x = scale(median) + spread * ndtri(quantile)
+    low, high = (_probability((scale(x) - scale(median)) / width) for x in (lower, upper))
+    quantile = low + (high - low) * _probability(score)
+    deviate = math.sqrt(2) * erf_inv(jnp.clip(2 * quantile - 1, -1 + 1e-6, 1 - 1e-6))  # within 4.9
+    x = scale(median) + spread * deviate
     x = jnp.clip(jnp.where(_IS_NORMAL, x, jnp.exp(x)), lower, upper)
     values = dict(zip(PARAMETERS, x, strict=True))
     body = {name: values.pop(name) for name in BODY}
@@ -115,6 +116,11 @@ def sample_vehicles(
     if vehicle_type is None:
         return jax.vmap(lambda k: sample(population, k))(keys)
     return jax.vmap(lambda k, y: sample(population, k, y))(keys, vehicle_type)
+
+
+def _probability(score: Array) -> Array:
+    """Distribution function of the standard normal distribution."""
+    return 0.5 * (1 + erf(score / math.sqrt(2)))
 
 
 # ---- populations
