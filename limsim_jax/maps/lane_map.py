@@ -243,7 +243,7 @@ def project(
     lower row wins. NO_LANE where there is none. A point beyond the centre of a bend sees two ends of it
     and no foot between; with `heading`, only the nearer end is compared.
 
-    Meant for the start of a run: `to_frenet` is some fifty times faster.
+    Meant for the start of a run: `to_frenet` is some hundred times faster.
     """
     x, y = _as_float(lane_map, x), _as_float(lane_map, y)
     frozen, px, py = lax.stop_gradient((lane_map, x, y))
