@@ -27,10 +27,17 @@ from limsim_jax.traffic.neighbors import (
     other_lane,
     sort_vehicles,
 )
-from limsim_jax.types import Config, Driver, Shape, State
+from limsim_jax.types import Config, Driver, Shape, State, Status
 
 _BEND_POINTS = 4  # places ahead on the own lane at which the bend is looked at
+PATIENCE = 10.0
+"""s of waiting at the end of a wrong lane before a driver gives up the route."""
+
+AT_END = 20.0
+"""m from the end of a lane within which that counts."""
+
 _WALL = 1.0  # m before the end of a lane that leads nowhere
+_WALL_ROOM = 12.0  # m before it, kept free to change lanes from a standstill
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,7 @@ def decide(
     config: Config, traffic: Traffic, lane_map: LaneMap, driver: Driver, shape: Shape, state: State
 ) -> tuple[State, Decision]:
     """Look around once: leaders, bends, lane changes. Starts lane changes in the state."""
+    state = _give_up(lane_map, state)
     order = sort_vehicles(lane_map, state)
     ahead = look_ahead(config, lane_map, state)
     v0, v_ahead, distance = _speeds(lane_map, driver, state, ahead)
@@ -88,6 +96,26 @@ def decide(
     )
 
 
+def _give_up(lane_map: LaneMap, state: State) -> State:
+    """Who has waited `PATIENCE` s at the end of a lane that does not lead to the goal takes another goal.
+
+    The nearest one that the lane does lead to, without another lane change if possible; recorded as
+    `Status.MISSED_ROUTE`.
+    """
+    routes = lane_map.routes
+    leads_on = (routes.next_lane[state.lane] != NO_LANE) | routes.is_goal[state.lane]  # [N, G]
+    own = jnp.take_along_axis(leads_on, state.goal[:, None], 1)[:, 0]
+    stuck = state.active & ~own & (state.waiting > PATIENCE)
+    stuck &= lane_map.length[state.lane] - state.s < AT_END
+    cost = jnp.where(leads_on, routes.distance[state.lane], jnp.inf)
+    goal = jnp.argmin(cost, -1).astype(state.goal.dtype)
+    changes = stuck & leads_on.any(-1)
+    return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        goal=jnp.where(changes, goal, state.goal),
+        status=state.status | jnp.where(changes, int(Status.MISSED_ROUTE), 0),
+    )
+
+
 def _stay(state: State) -> LaneChoice:
     zero = jnp.zeros_like(state.side)
     none = jnp.zeros_like(state.v)
@@ -108,6 +136,8 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
     at_goal = lane_map.routes.is_goal[ahead.lane, goal]
     stuck = (lane_map.routes.next_lane[ahead.lane, goal] == NO_LANE) & ~at_goal & (ahead.lane != NO_LANE)
     end = ahead.start + lane_map.length[ahead.lane] - _WALL
+    room = end - (_WALL_ROOM - _WALL)
+    end = jnp.where((state.side == 0)[:, None] & (room > 0), room, end)
     return jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
 
 

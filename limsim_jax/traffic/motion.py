@@ -21,7 +21,7 @@ from limsim_jax.types import Config, Driver, Shape, State, Status
 WALKING_SPEED = 1.5
 """m/s, below which a vehicle counts as waiting."""
 
-CREEP_SPEED = 5.0
+CREEP_SPEED = 2.0
 """m/s, below which a lane change goes on by distance, not by time: what stands does not slide."""
 
 _HAND_OVERS = 3  # lanes that a vehicle may leave behind in one step
@@ -54,7 +54,7 @@ def accelerations(
     def seen(index: Int[Array, "*b"], value: Float[Array, " N"]) -> Float[Array, "*b"]:
         return jnp.where(index >= 0, value[index], 0)
 
-    none = gap0 >= NO_GAP
+    none = (gap0 >= NO_GAP) | (moving & ~state.active[index])  # who leaves the map is no obstacle
     gap = jnp.where(none, NO_GAP, gap0 + seen(index, x) - x[:, None])
     v_lead = jnp.where(none, state.v[:, None], seen(index, state.v))
     a_lead = jnp.where(moving, seen(index, state.a), 0)
@@ -65,7 +65,7 @@ def accelerations(
     a = model(
         per_obstacle(driver), gap=gap, v=state.v[:, None], v_lead=v_lead, a_lead=a_lead, v0=v0[:, None]
     ).min(-1)
-    polite = decision.courtesy >= 0
+    polite = (decision.courtesy >= 0) & state.active[decision.courtesy]
     gap = jnp.where(polite, decision.courtesy_gap + seen(decision.courtesy, x) - x, NO_GAP)
     v_lead = jnp.where(polite, seen(decision.courtesy, state.v), state.v)
     kind = model(driver, gap=gap, v=state.v, v_lead=v_lead, a_lead=jnp.zeros_like(a), v0=v0)
