@@ -7,7 +7,7 @@ import pytest
 from traffic_worlds import bundled, scattered, shapes, state_of
 
 from limsim_jax.maps.lane_map import NO_LANE
-from limsim_jax.traffic.neighbors import ABSENT, neighbors, other_lane, sort_vehicles
+from limsim_jax.traffic.neighbors import ABSENT, neighbors, other_lane, place_of, sort_vehicles
 from limsim_jax.types import Config
 
 CONFIG = Config(dt=0.1)
@@ -79,7 +79,8 @@ def test_neighbors_are_those_of_the_loop(name, n, seed):
     @jax.jit
     def query(state, shape, lane, s):
         order = sort_vehicles(lane_map, state)
-        return neighbors(CONFIG, lane_map, order, shape, state.goal, lane, s)
+        here = place_of(order, lane_map, lane, s)
+        return neighbors(CONFIG, lane_map, order, shape, state.goal, lane, s, here)
 
     pair = query(state, shape, jnp.asarray(lane), jnp.asarray(s))
     found_any = 0
@@ -98,7 +99,10 @@ def test_nobody_sees_empty_slots_or_itself():
     goal = int(np.nonzero(np.asarray(lane_map.routes.reachable)[0])[0][0])
     state = state_of([0, 0, 0], [100.0, 130.0, 160.0], [10.0] * 3, [goal] * 3, active=[True, False, True])
     order = sort_vehicles(lane_map, state)
-    pair = neighbors(CONFIG, lane_map, order, shapes(3), state.goal, state.lane[:, None], state.s[:, None])
+    here = (order.rank[:3] + 1)[:, None]
+    pair = neighbors(
+        CONFIG, lane_map, order, shapes(3), state.goal, state.lane[:, None], state.s[:, None], here
+    )
     assert pair.lead[:, 0].tolist()[::2] == [2, -1]
     assert pair.lag[:, 0].tolist()[::2] == [-1, 0]
     assert float(pair.lead_gap[0, 0]) == 55.0 and float(pair.lag_gap[2, 0]) == 55.0

@@ -25,6 +25,7 @@ from limsim_jax.traffic.neighbors import (
     look_ahead,
     neighbors,
     other_lane,
+    place_of,
     sort_vehicles,
 )
 from limsim_jax.types import Config, Driver, Shape, State, Status
@@ -68,6 +69,7 @@ def decide(
     side = jnp.where((state.step // config.decision_every) % 2 == 0, 1, -1)
     beside, beside_s, allowed = place_beside(lane_map, shape, state, side)
     other, other_s = other_lane(lane_map, state)
+    n = state.lane.shape[0]
     found = neighbors(
         config,
         lane_map,
@@ -76,6 +78,7 @@ def decide(
         state.goal,
         jnp.stack([jnp.where(state.active, state.lane, NO_LANE), other, beside], -1),
         jnp.stack([state.s, other_s, beside_s], -1),
+        jnp.stack([order.rank[:n] + 1, order.rank[n:] + 1, place_of(order, lane_map, beside, beside_s)], -1),
     )
     own, second, new = (jax.tree.map(lambda x: x[:, k], found) for k in range(3))  # noqa: B023
     if traffic.lane_changes:

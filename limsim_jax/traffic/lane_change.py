@@ -116,18 +116,6 @@ def choose_lane(
     the distance that they have.
     """
 
-    def follows(i: Int[Array, " N"], gap: Float[Array, " N"], j: Int[Array, " N"]) -> Float[Array, " N"]:
-        """Acceleration of vehicle i behind vehicle j (-1: free road)."""
-        free = j < 0
-        return model(
-            jax.tree.map(lambda x: x[i], driver),
-            gap=jnp.where(free, NO_GAP, gap),
-            v=state.v[i],
-            v_lead=jnp.where(free, state.v[i], state.v[j]),
-            a_lead=jnp.where(free, 0, state.a[j]),
-            v0=v0[i],
-        )
-
     me = jnp.arange(state.lane.shape[0], dtype=jnp.int32)
     routes = lane_map.routes
     to_go = routes.lanes_to_go[state.lane, state.goal]
@@ -136,14 +124,27 @@ def choose_lane(
     wanted = jnp.sign(to_go)
     reachable = routes.reachable[lane, state.goal]
 
-    own_now = follows(me, own.lead_gap, own.lead)
-    own_then = follows(me, pair.lead_gap, pair.lead)
+    # six accelerations in one call: who (i) follows whom (j, -1: free road) at what gap
     between = pair.lag_gap + shape.length + pair.lead_gap  # from the new follower to the new leader
-    new_now = follows(pair.lag, between, pair.lead)
-    new_then = follows(pair.lag, pair.lag_gap, me)
     around = own.lag_gap + shape.length + own.lead_gap
-    old_now = follows(own.lag, own.lag_gap, me)
-    old_then = follows(own.lag, around, own.lead)
+    cases = [
+        (me, own.lead, own.lead_gap),
+        (me, pair.lead, pair.lead_gap),
+        (pair.lag, pair.lead, between),
+        (pair.lag, me, pair.lag_gap),
+        (own.lag, me, own.lag_gap),
+        (own.lag, own.lead, around),
+    ]
+    i, j, gap = (jnp.stack(column, -1) for column in zip(*cases, strict=True))
+    free = j < 0
+    own_now, own_then, new_now, new_then, old_now, old_then = model(
+        jax.tree.map(lambda x: x[i], driver),
+        gap=jnp.where(free, NO_GAP, gap),
+        v=state.v[i],
+        v_lead=jnp.where(free, state.v[i], state.v[j]),
+        a_lead=jnp.where(free, 0, state.a[j]),
+        v0=v0[i],
+    ).T
     follower, old = pair.lag >= 0, own.lag >= 0
     advantage = incentive(
         own_now=own_now,

@@ -47,12 +47,18 @@ class Pair(NamedTuple):
 
 
 class Order(NamedTuple):
-    """Vehicles in order of lane and position, `E` = 2N entries; those of no lane last."""
+    """Vehicles in order of lane and position, `E` = 2N entries; those of no lane last.
+
+    Entry i < N is vehicle i on its lane, entry N + i the same vehicle on its other lane.
+    """
 
     key: Int[Array, " E"]
     vehicle: Int[Array, " E"]  # slot
     lane: Int[Array, " E"]
     s: Float[Array, " E"]  # m, front bumper
+    rank: Int[Array, " E"]  # place of every entry in the order
+    first: Int[Array, " L"]  # place of the first entry of every lane, E if there is none
+    last: Int[Array, " L"]  # and of the last, -1 if there is none
 
 
 @jax.named_scope("look_ahead")
@@ -71,10 +77,24 @@ def sort_vehicles(lane_map: LaneMap, state: State) -> Order:
     other, other_s = other_lane(lane_map, state)
     lane = jnp.concatenate([jnp.where(state.active, state.lane, NO_LANE), other])
     s = jnp.concatenate([state.s, other_s])
-    slot = jnp.arange(state.lane.shape[0], dtype=jnp.int32)
-    vehicle = jnp.concatenate([slot, slot])
-    key, vehicle, lane, s = lax.sort((_key(lane_map, lane, s), vehicle, lane, s), num_keys=1)
-    return Order(key, vehicle, lane, s)
+    size, count = lane_map.length.shape[0], lane.shape[0]
+    place = jnp.arange(count, dtype=jnp.int32)
+    key, entry = lax.sort((_key(lane_map, lane, s), place), num_keys=1)
+    lane, s = lane[entry], s[entry]
+    # unique indices, the others out of bounds and dropped: no two writes meet
+    changes = lane[1:] != lane[:-1]
+    begins = jnp.concatenate([jnp.ones(1, bool), changes]) & (lane != NO_LANE)
+    ends = jnp.concatenate([changes, jnp.ones(1, bool)]) & (lane != NO_LANE)
+    unique = {"mode": "drop", "unique_indices": True}
+    return Order(
+        key=key,
+        vehicle=jnp.where(entry < count // 2, entry, entry - count // 2),
+        lane=lane,
+        s=s,
+        rank=jnp.zeros(count, jnp.int32).at[entry].set(place, **unique),
+        first=jnp.full(size, count, jnp.int32).at[jnp.where(begins, lane, size + place)].set(place, **unique),
+        last=jnp.full(size, -1, jnp.int32).at[jnp.where(ends, lane, size + place)].set(place, **unique),
+    )
 
 
 def other_lane(lane_map: LaneMap, state: State) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
@@ -92,8 +112,12 @@ def _key(lane_map: LaneMap, lane: Int[Array, "*b"], s: Float[Array, "*b"]) -> In
     return (row << _POSITION_BITS) | part.astype(jnp.uint32)
 
 
-def _find(order: Order, key: Int[Array, "*b"], side: str) -> Int[Array, "*b"]:
-    return jnp.searchsorted(order.key, key, side=side, method="scan_unrolled").astype(jnp.int32)
+def place_of(
+    order: Order, lane_map: LaneMap, lane: Int[Array, "*b"], s: Float[Array, "*b"]
+) -> Int[Array, "*b"]:
+    """Place in the order of the first entry beyond `s` (m) on `lane`: a binary search."""
+    key = _key(lane_map, lane, s)
+    return jnp.searchsorted(order.key, key, side="right", method="scan_unrolled").astype(jnp.int32)
 
 
 def _entry(
@@ -115,8 +139,12 @@ def neighbors(
     goal: Int[Array, " N"],
     lane: Int[Array, "N K"],
     s: Float[Array, "N K"],
+    here: Int[Array, "N K"],
 ) -> Pair:
     """Leaders and followers of every vehicle as if it stood at `s` (m) of `lane`, for K places each.
+
+    `here` is the place of the first entry beyond it: `place_of`, or for a vehicle where it is, its own
+    `rank` + 1.
 
     The leader is looked for along the route from there, within `config.look_ahead`; the follower on the
     lane, else on the last stretch of two of its predecessors. The vehicle itself does not count.
@@ -125,7 +153,6 @@ def neighbors(
     me = jnp.arange(lane.shape[0], dtype=jnp.int32)[:, None]
     goal = jnp.broadcast_to(goal[:, None], lane.shape)
 
-    # three binary searches at once: the place itself, the start of the lanes ahead, the end of those behind
     lanes, starts = [], []
     start, after = lane_map.length[lane] - s, lane
     for _ in range(config.look_ahead_lanes):
@@ -135,12 +162,7 @@ def neighbors(
         start = start + lane_map.length[after]
     ahead, offset = jnp.stack(lanes, -1), jnp.stack(starts, -1)  # [N, K, D]
     behind = lane_map.predecessors[lane][..., :_UPSTREAM]  # [N, K, P]
-    size = lane_map.length.shape[0]
-    beyond = jnp.where(behind == NO_LANE, size, behind + 1)  # the first lane after it in the order
-    here = _find(order, _key(lane_map, lane, s), "right")
-    edge = jnp.concatenate([jnp.where(ahead == NO_LANE, size, ahead), beyond], -1).astype(jnp.uint32)
-    found = _find(order, edge << _POSITION_BITS, "left")
-    first, last = found[..., : config.look_ahead_lanes], found[..., config.look_ahead_lanes :] - 1
+    first, last = order.first[ahead], order.last[behind]
 
     # leader: the next entry that is not oneself, else the last vehicle of the lanes that follow
     vehicle, position = _entry(order, here, lane)
