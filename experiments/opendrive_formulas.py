@@ -230,6 +230,14 @@ class RoadFormulas:
         x, y, heading, speed, turn_rate = out
         return x, y, heading, speed, turn_rate
 
+    def point(self, s: float, t: float, turn: float = 0.0, u: float = 0.0, v: float = 0.0) -> Array:
+        """A place `[2]`, `u, v` away from (s, t) in axes turned against the reference line."""
+        x, y, heading, _, _ = (float(a[0]) for a in self.reference(s))
+        c, n = math.cos(heading + turn), math.sin(heading + turn)
+        return np.array(
+            [x - t * math.sin(heading) + u * c - v * n, y + t * math.cos(heading) + u * n + v * c]
+        )
+
     def section_at(self, s: float) -> int:
         """Index of the lane section that holds at `s`."""
         return max(bisect_right(self.starts, s) - 1, 0)
@@ -423,33 +431,30 @@ class OpenDriveFormulas:
                         found.append((kind, signal.get("id", ""), road.id, number))
         return found
 
-    def crosswalk_centers(self) -> list[tuple[Array, Array]]:
-        """Mean corner of every crosswalk outline, and the same with the lane offset added to its `t`.
+    def crosswalks(self) -> list[tuple[Array, Array]]:
+        """Corners `[K, 2]` of every crosswalk, and the same with the road's lane offset added to its `t`.
 
         `t` is measured from the reference line (OpenDRIVE 1.8, 7.3), to which the lane offset adds nothing.
         """
         found = []
         for road in self.roads.values():
             for thing in road.element.iterfind("objects/object"):
-                corners = [(_number(c, "u"), _number(c, "v")) for c in thing.iter("cornerLocal")]
-                if thing.get("type") != "crosswalk" or not corners:
+                if thing.get("type") != "crosswalk":
                     continue
-                if len(corners) > 1 and np.allclose(corners[0], corners[-1]):
-                    corners = corners[:-1]
-                x, y, heading, _, _ = (v[0] for v in road.reference(_number(thing, "s")))
-                u, v = np.mean(corners, 0)
-                turn = heading + _number(thing, "hdg")
-                shift = road.offset(np.array([_number(thing, "s")]))[0][0]
-                places = [
-                    np.array(
-                        [
-                            x - t * math.sin(heading) + u * math.cos(turn) - v * math.sin(turn),
-                            y + t * math.cos(heading) + u * math.sin(turn) + v * math.cos(turn),
-                        ]
-                    )
-                    for t in (_number(thing, "t"), _number(thing, "t") + shift)
+                outline = next(thing.iter("outline"), ())
+                on_road = [(_number(c, "s"), _number(c, "t")) for c in outline if c.tag == "cornerRoad"]
+                local = [(_number(c, "u"), _number(c, "v")) for c in outline if c.tag == "cornerLocal"]
+                if not on_road and not local:
+                    u, v = _number(thing, "length") / 2, _number(thing, "width") / 2
+                    local = [(-u, -v), (u, -v), (u, v), (-u, v)]
+                s, t = _number(thing, "s"), _number(thing, "t")
+                shift = float(road.offset(np.array([s]))[0][0])
+                corners = [
+                    [road.point(*corner) for corner in on_road]
+                    or [road.point(s, t + by, _number(thing, "hdg"), *corner) for corner in local]
+                    for by in (0.0, shift)
                 ]
-                found.append((places[0], places[1]))
+                found.append((np.array(corners[0]), np.array(corners[1])))
         return found
 
     def junction_ids(self) -> list[str]:
