@@ -157,7 +157,8 @@ def _speeds(
     speed = jnp.where(lane == NO_LANE, NO_GAP, speed)
     # the own lane: its bend at a few places within braking distance
     reach = state.v * state.v / driver.b + 10.0
-    there = reach[:, None] * (jnp.arange(1, _BEND_POINTS + 1, dtype=reach.dtype) / _BEND_POINTS)
+    share = jnp.arange(1, _BEND_POINTS + 1, dtype=reach.dtype) / _BEND_POINTS
+    there = reach[:, None] * share[None, :]
     bend = jnp.abs(curvature(lane_map, state.lane[:, None], state.s[:, None] + there))
     own = jnp.sqrt(driver.a_lat[:, None] / jnp.maximum(bend, 1e-6))
     speed = jnp.concatenate([speed, own], -1)

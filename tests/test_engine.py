@@ -1,0 +1,207 @@
+"""The engine on roads without junctions: traffic that follows, changes lanes, and leaves."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from traffic_worlds import bundled, drivers, scattered, shapes, state_of
+
+from limsim_jax.geometry import box_separation
+from limsim_jax.maps.lane_map import lane_rows, width
+from limsim_jax.traffic.car_following import ACC, IDM
+from limsim_jax.traffic.engine import Traffic, drive
+from limsim_jax.traffic.lane_change import incentive, urgency
+from limsim_jax.traffic.motion import boxes, smooth_step
+from limsim_jax.types import Config, Status
+
+CONFIG = Config(dt=0.1)
+separations = jax.vmap(jax.vmap(box_separation, (None, 0)), (0, None))
+
+
+@functools.cache
+def runner(name: str, traffic: Traffic, decisions: int):
+    """A jitted run of one world that records what tests look at."""
+    _, lane_map = bundled(name)
+
+    @jax.jit
+    def run(state, driver, shape):
+        def record(tick):
+            box = boxes(lane_map, driver, shape, tick.state)
+            n = box.shape[0]
+            both = tick.state.active[:, None] & tick.state.active[None, :] & ~jnp.eye(n, dtype=bool)
+            apart = jnp.where(both, separations(box, box), 99.0).min()
+            state = tick.state
+            return {
+                "apart": apart, "a": state.a, "v": state.v, "d": state.d, "lane": state.lane, "s": state.s,
+                "active": state.active, "side": state.side, "x": box[:, 0], "y": box[:, 1], "left": tick.left,
+            }  # fmt: skip
+
+        def decision(state, _):
+            return drive(CONFIG, traffic, lane_map, driver, shape, state, record)
+
+        state, records = jax.lax.scan(decision, state, None, length=decisions)
+        return state, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
+
+    return run
+
+
+def mixed(n, seed):
+    """Drivers of different temper."""
+    rng = np.random.default_rng(seed)
+    factor = jnp.asarray(rng.uniform(0.75, 1.1, n), jnp.float32)
+    return drivers(n).replace(speed_factor=factor, T=jnp.asarray(rng.uniform(0.9, 1.8, n), jnp.float32))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_random_traffic_on_a_highway_is_sound(seed):
+    n = 64
+    network, lane_map = bundled("highway")
+    start = scattered("highway", n, seed)
+    shape = shapes(n).replace(length=jnp.asarray(np.random.default_rng(seed).uniform(4, 12, n), jnp.float32))
+    end, trace = runner("highway", Traffic(), 400)(start, mixed(n, seed), shape)
+    trace = {name: np.asarray(value) for name, value in trace.items()}
+    active = trace["active"]
+    assert trace["apart"].min() > 0, "bodies overlap"
+    assert trace["a"].min() > -4.0, "nobody has to brake hard"
+    assert np.isfinite(trace["v"]).all() and (trace["v"] >= 0).all()
+    # nobody leaves the road: the centre stays within the lane, but for lane changes to a neighbour
+    half = np.asarray(width(lane_map, jnp.asarray(trace["lane"]), jnp.asarray(trace["s"]))) / 2
+    assert (np.abs(trace["d"])[active] <= half[active] + 0.01).all()
+    # bodies move by what their speed says: nobody jumps
+    step = np.hypot(np.diff(trace["x"], axis=0), np.diff(trace["y"], axis=0))
+    both = active[1:] & active[:-1]
+    assert (step[both] < trace["v"][:-1][both] * CONFIG.dt + 0.35).all()
+    assert (trace["side"][active] != 0).mean() > 0.005, "somebody changes lanes"
+    assert trace["left"].sum() == n - int(end.active.sum()) > n // 2, "who leaves, leaves once"
+    assert not int(np.bitwise_or.reduce(np.asarray(end.status))) & int(Status.HARD_BRAKE)
+    assert network.lanes
+
+
+def test_lane_ends_and_exits_are_reached_without_overlap():
+    """On-ramp and off-ramp: all get through, those that could not change in time too."""
+    n = 64
+    start = scattered("ramp", n, 3)
+    end, trace = runner("ramp", Traffic(), 500)(start, mixed(n, 3), shapes(n))
+    assert float(trace["apart"].min()) > 0
+    assert int(end.active.sum()) == 0
+    assert float(trace["a"].min()) >= -8.001
+
+
+def platoon(model, n=6, v=20.0):
+    """Vehicles one behind the other on one lane of the highway; the first one holds them up."""
+    network, lane_map = bundled("highway")
+    rows = lane_rows(network)
+    row = rows["1_0_-3"]
+    goal = int(np.nonzero(np.asarray(lane_map.routes.reachable)[row])[0][0])
+    driver = drivers(n, T=1.5, b=2.0, a=1.4).replace(v_max=jnp.asarray([v] + [60.0] * (n - 1), jnp.float32))
+    state = state_of([row] * n, [600.0 - 40.0 * i for i in range(n)], [v] * n, [goal] * n)
+    return state, driver, Traffic(model=model, lane_changes=False)
+
+
+@pytest.mark.parametrize(("model", "exact"), [(ACC(), True), (IDM(), False)])
+def test_a_platoon_settles_at_the_equilibrium_gap(model, exact):
+    state, driver, traffic = platoon(model)
+    _, trace = runner("highway", traffic, 160)(state, driver, shapes(6))
+    gap = np.asarray(trace["s"][-1, :-1] - trace["s"][-1, 1:]) - 5.0
+    v = np.asarray(trace["v"][-1])
+    np.testing.assert_allclose(v, 20.0, atol=0.02)
+    free = np.asarray(driver.speed_factor * 120 / 3.6)[1:]
+    expected = 2.0 + 1.5 * 20.0
+    if not exact:  # IDM: (s0 + v T) / sqrt(1 - (v / v0)^4)
+        expected = expected / np.sqrt(1 - (20.0 / free) ** 4)
+    np.testing.assert_allclose(gap, expected, atol=0.15)
+
+
+def test_slots_may_be_permuted():
+    n = 24
+    order = np.random.default_rng(0).permutation(n)
+    start, driver, shape = scattered("highway", n, 5), mixed(n, 5), shapes(n)
+    shuffled = jax.tree.map(lambda x: x[order] if jnp.ndim(x) else x, (start, driver, shape))
+    run = runner("highway", Traffic(), 40)
+    end, _ = run(start, driver, shape)
+    other, _ = run(*shuffled)
+    for name in ("lane", "s", "v", "d", "side"):
+        np.testing.assert_array_equal(getattr(end, name)[order], getattr(other, name), err_msg=name)
+
+
+def test_a_world_does_not_depend_on_its_companions():
+    n = 24
+    _, lane_map = bundled("highway")
+    driver, shape = mixed(n, 5), shapes(n)
+    states = [scattered("highway", n, seed) for seed in (5, 6, 7)]
+
+    @jax.jit
+    def run(state):
+        step = lambda s: jax.lax.scan(  # noqa: E731
+            lambda c, _: drive(CONFIG, Traffic(), lane_map, driver, shape, c), s, None, length=20
+        )[0]
+        return jax.vmap(step)(state)
+
+    stack = lambda worlds: jax.tree.map(lambda *x: jnp.stack(x), *worlds)  # noqa: E731
+    one, two = run(stack(states)), run(stack([states[0], states[0], states[0]]))
+    for name in ("lane", "s", "v", "d"):
+        np.testing.assert_array_equal(getattr(one, name)[0], getattr(two, name)[0], err_msg=name)
+
+
+def test_gradients_are_those_of_finite_differences():
+    state, driver, traffic = platoon(ACC(), n=4)
+    _, lane_map = bundled("highway")
+    empty = dataclasses.replace(state, active=jnp.asarray([True, True, True, False]))
+
+    def loss(T):
+        def decision(state, _):
+            return drive(CONFIG, traffic, lane_map, driver.replace(T=T), shapes(4), state)
+
+        end, _ = jax.lax.scan(decision, empty, None, length=20)
+        return jnp.sum(jnp.where(end.active, end.s, 0.0))
+
+    T = driver.T
+    gradient = jax.jit(jax.grad(loss))(T)
+    assert np.isfinite(np.asarray(gradient)).all() and float(gradient[3]) == 0.0
+    run = jax.jit(loss)
+    for i in (1, 2):
+        h = 0.05
+        difference = (run(T.at[i].add(h)) - run(T.at[i].add(-h))) / (2 * h)
+        assert float(difference) != 0
+        np.testing.assert_allclose(float(gradient[i]), float(difference), rtol=0.03)
+
+
+# --- the parts ----------------------------------------------------------------------------------
+
+
+def test_mobil_incentive():
+    values = {
+        "own_now": 0.2,
+        "own_then": 1.0,
+        "new_now": 0.5,
+        "new_then": -0.3,
+        "old_now": -0.1,
+        "old_then": 0.4,
+    }
+    arrays = {name: jnp.float32(value) for name, value in values.items()}
+    # egoist: own gain alone; altruist: + (-0.3 - 0.5) + (0.4 + 0.1)
+    np.testing.assert_allclose(incentive(**arrays, politeness=jnp.float32(0.0)), 0.8, rtol=1e-6)
+    np.testing.assert_allclose(incentive(**arrays, politeness=jnp.float32(1.0)), 0.5, rtol=1e-6)
+
+
+def test_urgency_grows_towards_the_last_place_and_with_the_lanes_to_cross():
+    room = jnp.asarray([1e9, 300.0, 120.0, 40.0, 0.0], jnp.float32)
+    v, time = jnp.full(5, 20.0), jnp.full(5, 4.5)
+    one = np.asarray(urgency(jnp.full(5, -1), room, v, time))
+    two = np.asarray(urgency(jnp.full(5, 2), room, v, time))
+    assert one[0] == 0 and one[-1] == 1 and (np.diff(one) >= 0).all()
+    assert (two >= one).all() and two[1] > one[1] - 1e-6 and two[2] > one[2]
+    assert not np.asarray(urgency(jnp.zeros(5, int), room, v, time)).any()
+
+
+def test_lateral_motion_is_the_quintic():
+    """Peaks of the quintic over time T and width w: 1.875 w / T and 5.7735 w / T^2."""
+    u = jnp.linspace(0, 1, 2001)
+    f = np.asarray(smooth_step(u), float)
+    slope, bend = np.gradient(f, 1 / 2000), np.diff(f[::50], 2) * 40**2
+    assert f[0] == 0 and f[-1] == 1 and np.diff(f).min() > -1e-6
+    np.testing.assert_allclose(slope.max(), 1.875, rtol=1e-3)
+    np.testing.assert_allclose(np.abs(bend).max(), 5.7735, rtol=2e-2)
