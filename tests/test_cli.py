@@ -213,6 +213,16 @@ def test_user_errors_are_one_line(case, run, tmp_path, monkeypatch):
     assert clue in err
 
 
+@pytest.mark.parametrize(
+    "content", [b"<OpenDRIVE>\x00</OpenDRIVE>", b"<!-- nothing -->", b"\x00", b"\x1f\x8bgzip?", b"<a><b>"]
+)
+def test_load_map_refuses_with_one_line(content, tmp_path):
+    (tmp_path / "map.xodr").write_bytes(content)
+    with pytest.raises(lj.MapError) as caught:
+        lj.load_map(tmp_path / "map.xodr")
+    assert "\n" not in str(caught.value) and "map.xodr" in str(caught.value)
+
+
 def test_bug_is_a_traceback(run, write, monkeypatch):
     def broken(network):
         raise RuntimeError("a bug")

@@ -128,5 +128,5 @@ def _root_element(data: bytes, path: Path) -> str:
         return etree.QName(next(iter(start))[1]).localname
     except (etree.XMLSyntaxError, StopIteration) as error:
         line = getattr(error, "lineno", None)
-        reason = getattr(error, "msg", "it has no root element")
+        reason = getattr(error, "msg", None) or "it has no root element"
         raise MapError(f"not well-formed XML: {reason}", file=path, line=line) from None

@@ -36,10 +36,16 @@ class MapError(ValueError):
     ) -> None:
         self.reason, self.file, self.line, self.element = reason, file, line, element
         place = f"{file if file is not None else 'map'}" + (f":{line}" if line else "")
-        super().__init__(": ".join(str(part) for part in (place, element, reason) if part))
+        super().__init__(": ".join(_one_line(part) for part in (place, element, reason) if part))
 
     def __reduce__(self) -> Any:
         return _rebuild_map_error, (self.reason, self.file, self.line, self.element)
+
+
+def _one_line(text: str, longest: int = 500) -> str:
+    """The text without line breaks, and without its middle where it is very long."""
+    text = " ".join(text.split())
+    return text if len(text) <= longest else f"{text[: longest // 2]} ... {text[-longest // 4 :]}"
 
 
 def _rebuild_map_error(reason: str, file: Any, line: Any, element: Any) -> MapError:
