@@ -38,7 +38,9 @@ def read_bytes(path: str | Path) -> bytes:
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise MapError(f"damaged gzip data ({error})", file=path) from None
     except OSError as error:
-        raise MapError(f"cannot be read ({error.strerror})", file=path) from None
+        raise MapError(f"cannot be read ({error.strerror or error})", file=path) from None
+    except ValueError as error:  # a path with a null byte
+        raise MapError(f"cannot be read ({error})", file=path) from None
     if len(data) > MAX_BYTES:
         raise MapError("larger than 2 GiB", file=path)
     if not data.strip():

@@ -24,7 +24,7 @@ JUMP = 0.01  # m; where lane edges jump by more, the lane is cut
 _SHORTEST = 2e-3  # m; records that hold for less are rounding errors of the writer
 _HERMITE = 1e-5  # m, tolerated error of cubic Hermite interpolation between samples
 _LINEAR = 5e-4  # m, tolerated error of linear interpolation of widths between samples
-_BRIDGE = 120.0  # a jump is smoothed over this multiple of it: headings are off by 1.5 / 120 rad
+_BRIDGE = 120.0  # a sideways jump is smoothed over this multiple of it: headings are off by 1.5 / 120 rad
 _X, _W = np.polynomial.legendre.leggauss(4)
 _X, _W = (_X + 1) / 2, _W / 2
 
@@ -500,17 +500,21 @@ def sample_piece(road: RawRoad, piece: Piece, report: ImportReport) -> dict[int,
     # at every border of spans: how far do the left and right limits differ?
     here = np.arange(len(spans) - 1)
     before, after = evaluate(b[:-1], here), evaluate(a[1:], here + 1)
-    jump = np.hypot(after.x - before.x, after.y - before.y).max(0, initial=0.0)
+    dx, dy = after.x - before.x, after.y - before.y
+    jump = np.hypot(dx, dy).max(0, initial=0.0)
+    sideways = np.abs(dy * np.cos(before.heading) - dx * np.sin(before.heading)).max(0, initial=0.0)
     turn = np.abs(np.angle(np.exp(1j * (after.heading - before.heading)))).max(0, initial=0.0)
     step = np.abs(after.width - before.width).max(0, initial=0.0)
     kink = (jump > 1e-6) | (turn > 1e-5) | (step > 1e-6)
-    half = np.where(kink, np.maximum(5e-4, _BRIDGE / 2 * np.maximum(jump - 1e-5, 0.0)), 0.0)
+    half = np.maximum(_BRIDGE / 2 * np.maximum(sideways - 1e-5, 0.0), 1.5 * np.maximum(jump - 1e-5, 0.0))
+    half = np.where(kink, np.maximum(5e-4, half), 0.0)
     start, end = _leave_out(a, b, half)
-    for s, gap in zip(b[:-1][jump > 1e-3], jump[jump > 1e-3], strict=True):
+    far = jump > 1e-3
+    for s, gap, room in zip(b[:-1][far], jump[far], half[far], strict=True):
         report.approximated(
             "lane geometry",
             f"road {road.id} s={s:.3f}",
-            f"jumps by {gap * 1000:.1f} mm between two records: smoothed over {_BRIDGE * gap:.2f} m",
+            f"jumps by {gap * 1000:.1f} mm between two records: smoothed over {2 * room:.2f} m",
             road.line,
         )
 
@@ -659,6 +663,10 @@ def _report_shape(
     for section, a, b in piece.parts:
         lane = section.lanes[number]
         if lane.width is None:
+            if lane.border is not None and values.width[row].max() <= 0:
+                report.approximated(
+                    "lane border", where, "lies on the inner side of the lane: the width is 0", lane.line
+                )
             continue
         s = np.linspace(a, b, 33)
         lowest = lane.width(s - section.s, s - section.s).min()

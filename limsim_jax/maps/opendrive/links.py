@@ -272,18 +272,15 @@ class Linker:
             for k in range(len(road.sections))
             if (road.id, k) not in self.piece_at
         }
-        for road_id, k in sorted(dropped):
+        touching: dict[End, dict[End, int | None]] = defaultdict(dict)
+        for c in self.contacts.values():
+            touching[c.a][c.b] = touching[c.b][c.a] = c.line
+        for road_id, k in sorted(dropped):  # ascending: what is passed on is passed on again
             for number in self.roads[road_id].sections[k].lanes:
-                sides = {}
-                for side in ("start", "end"):
-                    me = (road_id, k, number, side)
-                    sides[side] = [
-                        (c.b if c.a == me else c.a, c.line)
-                        for c in self.contacts.values()
-                        if me in (c.a, c.b)
-                    ]
-                for a, line in sides["start"]:
-                    for b, _ in sides["end"]:
+                start, end = (touching.pop((road_id, k, number, side), {}) for side in ("start", "end"))
+                for a, line in start.items():
+                    for b in end:
+                        touching[a][b] = touching[b][a] = line
                         self._touch(a, b, line)
         self.contacts = {
             key: c

@@ -30,6 +30,7 @@ LARGEST = 1e8  # m, coordinates beyond this are not on Earth
 T = TypeVar("T", RawRoad, RawJunction, RawController)
 
 
+@np.errstate(all="ignore")  # what overflows is found by `_sound`
 def read_opendrive(path: str | Path) -> Network:
     """Read an OpenDRIVE file (.xodr, or gzipped) of any revision 1.x.
 
@@ -77,22 +78,21 @@ def read_opendrive(path: str | Path) -> Network:
         raise MapError("has no <road>", file=path)
     roads, junctions = _by_id(raw_roads, "road", path), _by_id(raw_junctions, "junction", path)
 
-    with np.errstate(all="ignore"):
-        cutter = Cutter(report)
-        pieces = {road.id: cutter.pieces(road, _attachments(road, roads)) for road in raw_roads}
-        lanes: dict[str, Lane] = {}
-        for road in raw_roads:
-            _report_road(road, pieces[road.id], report)
-            for piece in pieces[road.id]:
-                for lane in sample_piece(road, piece, report).values():
-                    if not _sound(lane):
-                        raise MapError(
-                            f"lane {lane.number} has no finite geometry below {LARGEST:g} m",
-                            file=path,
-                            line=road.line,
-                            element=f"<road {road.id}>",
-                        )
-                    lanes[lane.id] = lane
+    cutter = Cutter(report)
+    pieces = {road.id: cutter.pieces(road, _attachments(road, roads)) for road in raw_roads}
+    lanes: dict[str, Lane] = {}
+    for road in raw_roads:
+        _report_road(road, pieces[road.id], report)
+        for piece in pieces[road.id]:
+            for lane in sample_piece(road, piece, report).values():
+                if not _sound(lane):
+                    raise MapError(
+                        f"lane {lane.number} has no finite geometry below {LARGEST:g} m",
+                        file=path,
+                        line=road.line,
+                        element=f"<road {road.id}>",
+                    )
+                lanes[lane.id] = lane
     if not lanes:
         raise MapError("has no lanes", file=path)
 
@@ -208,10 +208,11 @@ def _report_road(road: RawRoad, pieces: list[Piece], report: ImportReport) -> No
                 record.line,
             )
     for before, after in itertools.pairwise(records):
-        s, at = np.array([after.s]), np.array([before.s + before.length / 2])
+        s = np.array([after.s, after.s])
+        at = np.array([before.s + before.length / 2, after.s + after.length / 2])
         x, y, heading, _, _ = road.reference.frame(s, at)
-        gap = float(np.hypot(x[0] - after.x, y[0] - after.y))
-        kink = abs(float(np.angle(np.exp(1j * (heading[0] - after.heading)))))
+        gap = float(np.hypot(x[1] - x[0], y[1] - y[0]))
+        kink = abs(float(np.angle(np.exp(1j * (heading[1] - heading[0])))))
         if gap > GAP or kink > KINK:
             report.approximated(
                 "geometry",
