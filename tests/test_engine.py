@@ -52,7 +52,9 @@ def mixed(n, seed):
     """Drivers of different temper."""
     rng = np.random.default_rng(seed)
     factor = jnp.asarray(rng.uniform(0.75, 1.1, n), jnp.float32)
-    return drivers(n).replace(speed_factor=factor, T=jnp.asarray(rng.uniform(0.9, 1.8, n), jnp.float32))
+    return dataclasses.replace(
+        drivers(n), speed_factor=factor, T=jnp.asarray(rng.uniform(0.9, 1.8, n), jnp.float32)
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -60,7 +62,9 @@ def test_random_traffic_on_a_highway_is_sound(seed):
     n = 64
     network, lane_map = bundled("highway")
     start = scattered("highway", n, seed)
-    shape = shapes(n).replace(length=jnp.asarray(np.random.default_rng(seed).uniform(4, 12, n), jnp.float32))
+    shape = dataclasses.replace(
+        shapes(n), length=jnp.asarray(np.random.default_rng(seed).uniform(4, 12, n), jnp.float32)
+    )
     end, trace = runner("highway", Traffic(), 400)(start, mixed(n, seed), shape)
     trace = {name: np.asarray(value) for name, value in trace.items()}
     active = trace["active"]
@@ -96,7 +100,9 @@ def platoon(model, n=6, v=20.0):
     rows = lane_rows(network)
     row = rows["1_0_-3"]
     goal = int(np.nonzero(np.asarray(lane_map.routes.reachable)[row])[0][0])
-    driver = drivers(n, T=1.5, b=2.0, a=1.4).replace(v_max=jnp.asarray([v] + [60.0] * (n - 1), jnp.float32))
+    driver = dataclasses.replace(
+        drivers(n, T=1.5, b=2.0, a=1.4), v_max=jnp.asarray([v] + [60.0] * (n - 1), jnp.float32)
+    )
     state = state_of([row] * n, [600.0 - 40.0 * i for i in range(n)], [v] * n, [goal] * n)
     return state, driver, Traffic(model=model, lane_changes=False)
 
@@ -153,7 +159,7 @@ def test_gradients_are_those_of_finite_differences():
 
     def loss(T):
         def decision(state, _):
-            return drive(CONFIG, traffic, lane_map, driver.replace(T=T), shapes(4), state)
+            return drive(CONFIG, traffic, lane_map, dataclasses.replace(driver, T=T), shapes(4), state)
 
         end, _ = jax.lax.scan(decision, empty, None, length=20)
         return jnp.sum(jnp.where(end.active, end.s, 0.0))

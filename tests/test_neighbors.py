@@ -1,5 +1,7 @@
 """Neighbours against a loop over all vehicles in plain Python."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -65,9 +67,10 @@ def test_neighbors_are_those_of_the_loop(name, n, seed):
     state = scattered(name, n, seed)
     rng = np.random.default_rng(seed)
     # unequal lengths, some slots empty, some vehicles in the midst of a lane change
-    shape = shapes(n).replace(length=jnp.asarray(rng.uniform(3, 9, n), jnp.float32))
+    shape = dataclasses.replace(shapes(n), length=jnp.asarray(rng.uniform(3, 9, n), jnp.float32))
     side = rng.integers(-1, 2, n)
-    state = state.replace(
+    state = dataclasses.replace(
+        state,
         active=jnp.asarray(rng.random(n) < 0.9),
         side=jnp.asarray(side, jnp.int32),
         crossed=jnp.asarray(rng.random(n) < 0.5) & (jnp.asarray(side) != 0),

@@ -6,7 +6,7 @@ same state. `drive` then integrates `Config.decision_every` physics steps that n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import jax
@@ -113,7 +113,8 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
     cost = jnp.where(leads_on, routes.distance[state.lane], jnp.inf)
     goal = jnp.argmin(cost, -1).astype(state.goal.dtype)
     changes = stuck & leads_on.any(-1)
-    return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+    return replace(
+        state,
         goal=jnp.where(changes, goal, state.goal),
         status=state.status | jnp.where(changes, int(Status.MISSED_ROUTE), 0),
     )
@@ -185,7 +186,7 @@ def drive(
         state, x = carry
         a = accelerations(traffic.model, driver, state, decision, x)
         state, dx, left = advance(config, lane_map, driver, state, a)
-        state = state.replace(step=state.step + 1)  # pyright: ignore[reportAttributeAccessIssue]
+        state = replace(state, step=state.step + 1)
         out = None if record is None else record(Tick(state, left))  # pyright: ignore[reportCallIssue]
         return (state, x + dx), out
 

@@ -6,6 +6,7 @@ are ours, after the lane-change bias of Treiber & Kesting, Traffic Flow Dynamics
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -137,14 +138,15 @@ def choose_lane(
     ]
     i, j, gap = (jnp.stack(column, -1) for column in zip(*cases, strict=True))
     free = j < 0
-    own_now, own_then, new_now, new_then, old_now, old_then = model(
+    accelerations = model(
         jax.tree.map(lambda x: x[i], driver),
         gap=jnp.where(free, NO_GAP, gap),
         v=state.v[i],
         v_lead=jnp.where(free, state.v[i], state.v[j]),
         a_lead=jnp.where(free, 0, state.a[j]),
         v0=v0[i],
-    ).T
+    )
+    own_now, own_then, new_now, new_then, old_now, old_then = (accelerations[:, k] for k in range(6))
     follower, old = pair.lag >= 0, own.lag >= 0
     advantage = incentive(
         own_now=own_now,
@@ -195,7 +197,8 @@ def start(lane_map: LaneMap, driver: Driver, state: State, choice: LaneChoice) -
     s_beside = side_s(lane_map, state.lane, state.s, choice.side)
     between = (width(lane_map, state.lane, state.s) + width(lane_map, beside, s_beside)) / 2
     shift = state.d - choice.side.astype(between.dtype) * between
-    return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+    return replace(
+        state,
         side=jnp.where(begins, choice.side, state.side),
         crossed=state.crossed & ~begins,
         progress=jnp.where(begins, 0, state.progress),

@@ -6,6 +6,7 @@ gap now is that gap plus what the obstacle has travelled since, less what the ve
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -89,7 +90,8 @@ def advance(
     realised = (v - state.v) / config.dt
     hard = realised < -driver.b_max - 0.01
     lane, previous, s, left = _hand_over(lane_map, state, state.s + dx)
-    state = state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+    state = replace(
+        state,
         step=state.step,
         lane=jnp.where(left, NO_LANE, lane),
         previous=jnp.where(left, NO_LANE, previous),
@@ -148,7 +150,8 @@ def _move_sideways(config: Config, lane_map: LaneMap, driver: Driver, state: Sta
     d = jnp.where(state.crossed, offset, offset + side * between)
     crosses = changing & ~state.crossed & (side * d > own_width / 2) & (beside != NO_LANE)
     finished = changing & (progress >= 1) & (state.crossed | crosses)
-    return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+    return replace(
+        state,
         lane=jnp.where(crosses, beside, state.lane),
         previous=jnp.where(
             crosses,
