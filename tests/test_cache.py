@@ -98,13 +98,28 @@ def test_moved_file_names_its_new_place(file, reads, tmp_path):
     assert reads == [file]
 
 
-def test_gzipped_map_is_the_same_map(file, tmp_path):
-    packed = tmp_path / "packed" / "town.xodr"
+NET = """<net version="1.16">
+<location netOffset="0,0" convBoundary="0,0,100,0" origBoundary="0,0,100,0" projParameter="!"/>
+<edge id="e" from="a" to="b" priority="1">
+  <lane id="e_0" index="0" speed="13.9" length="100" shape="0,0 100,0"/>
+</edge>
+<junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,3"/>
+<junction id="b" type="dead_end" x="100" y="0" incLanes="e_0" intLanes="" shape="100,0 100,3"/>
+</net>"""
+
+
+@pytest.mark.parametrize("form", ["OpenDRIVE", "SUMO"])
+def test_gzipped_map_is_the_same_map(form, file, tmp_path, reads, folder):
+    content = file.read_bytes() if form == "OpenDRIVE" else NET.encode()
+    file.write_bytes(content)
+    packed = tmp_path / "packed" / file.name
     packed.parent.mkdir()
-    packed.write_bytes(gzip.compress(file.read_bytes()))
-    plain, unpacked = lj.load_map(file, cache=False), lj.load_map(packed, cache=False)
+    packed.write_bytes(gzip.compress(content))
+    plain, unpacked = lj.load_map(file), lj.load_map(packed)
+    assert reads == [file]
     assert plain.file_hash == unpacked.file_hash
     assert list(plain.lanes) == list(unpacked.lanes)
+    assert len(entries(folder)) == 1
 
 
 def test_without_cache_leaves_no_trace(file, reads, folder):

@@ -425,7 +425,7 @@ class Network:
 
     name: str
     source: str  # path of the file
-    file_hash: str  # SHA-256 of its bytes
+    file_hash: str  # SHA-256 of its bytes, unpacked
     format: str  # "OpenDRIVE 1.4", "SUMO 1.16"
     geo_reference: str = ""
     lanes: dict[str, Lane]

@@ -9,8 +9,6 @@ of circular arcs and straight lines over it that is continuous in position and h
 
 from __future__ import annotations
 
-import gzip
-import hashlib
 import io
 import math
 import re
@@ -19,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, BinaryIO, overload
+from typing import Any, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -45,8 +43,8 @@ from limsim_jax.maps.network import (
     TrafficLight,
     Turn,
 )
+from limsim_jax.maps.xml import file_hash, read_bytes
 
-MAX_BYTES = 2**30  # of XML after decompression; the largest public SUMO scenarios stay below 0.5 GiB
 DEFAULT_WIDTH = 3.2  # m, SUMO's lane width where the file has none
 RESOLUTION = 0.01  # m, what two decimals resolve: netconvert's default precision
 BEND_SHARE = 0.1  # share of the lane width by which our curve may leave the shape of an ordinary lane
@@ -146,31 +144,6 @@ _CONTROLS = {
 }
 
 # ---------------------------------------------------------------------------------------------- XML
-
-
-def read_bytes(path: str | Path) -> bytes:
-    """Content of a file as it lies on the disk. Raises `MapError`."""
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise MapError(error.strerror or "cannot be read", file=path) from error
-
-
-def open_xml(data: bytes, path: str | Path) -> BinaryIO:
-    """Stream of the XML in `data`, gzipped or not, bounded by `MAX_BYTES`. Raises `MapError`."""
-    if data[:2] == b"\x1f\x8b":
-        try:
-            with gzip.open(io.BytesIO(data)) as stream:
-                data = stream.read(MAX_BYTES + 1)
-        except (OSError, EOFError, ValueError) as error:
-            raise MapError(f"damaged gzip file ({error})", file=path) from error
-        except Exception as error:  # zlib.error is not a subclass of any of the above
-            raise MapError(f"damaged gzip file ({error})", file=path) from error
-    if len(data) > MAX_BYTES:
-        raise MapError(f"more than {MAX_BYTES / 2**30:g} GiB of XML", file=path)
-    if not data.strip():
-        raise MapError("the file is empty", file=path)
-    return io.BytesIO(data)
 
 
 _PARSER: dict[str, Any] = dict(
@@ -331,11 +304,11 @@ def parse_xml(path: str | Path, roots: tuple[str, ...], report: ImportReport) ->
     data = read_bytes(path)
     xml = XmlFile(str(path), report)
     try:
-        root = etree.parse(open_xml(data, path), etree.XMLParser(**_PARSER)).getroot()
+        root = etree.parse(io.BytesIO(data), etree.XMLParser(**_PARSER)).getroot()
     except etree.XMLSyntaxError as error:
         raise xml.syntax_error(error) from error
     xml.check_document(root, roots)
-    return xml, root, hashlib.sha256(data).hexdigest()
+    return xml, root, file_hash(data)
 
 
 def stream_xml(
@@ -346,7 +319,7 @@ def stream_xml(
     root = None
     try:
         for event, element in etree.iterparse(
-            open_xml(read_bytes(path), path), events=("start", "end"), **_PARSER
+            io.BytesIO(read_bytes(path)), events=("start", "end"), **_PARSER
         ):
             if root is None:
                 root = element
