@@ -538,6 +538,32 @@ def test_degenerate_shapes_are_repaired_and_reported(read, shape, length, messag
     assert network.report.counts["lane", Action.READ] == 0
 
 
+@pytest.mark.parametrize("speed", ["0", "-0.0", "-5"])
+def test_speed_that_is_not_above_zero_is_that_of_the_other_lanes(read, speed):
+    lanes = [lane("e", i, f"0,{3 * i} 100,{3 * i}") for i in range(3)]
+    lanes[1] = lanes[1].replace('speed="10"', f'speed="{speed}"')
+    network = read(net(edge("e", *lanes)))
+    assert_sound(network)
+    assert [lane.speed_limit for lane in network.lanes.values()] == [10.0, 10.0, 10.0]
+    (message,) = notes(network, Action.REPAIRED, "lane")
+    assert "10 m/s" in message
+
+
+def test_link_that_is_its_own_foe_is_repaired(read):
+    good = read(junction_net())
+    network = read(GOOD.replace('response="00" foes="01"', 'response="10" foes="11"'))
+    assert network.movements == good.movements
+    assert notes(network, Action.REPAIRED, "request") == ["link 1 was its own foe; left out"]
+    assert network.report.counts["request", Action.READ] == 1
+
+
+def test_lanes_of_a_junction_that_is_none(read):
+    network = read(GOOD.replace('junction id="j" type="priority"', 'junction id="j" type="internal"'))
+    assert not network.junctions.get("j")
+    assert all(lane.junction in {None, *network.junctions} for lane in network.lanes.values())
+    assert any("no junction names it" in note for note in notes(network, Action.APPROXIMATED, "edge"))
+
+
 def test_kinks_between_lanes_are_reported(read):
     network = read(junction_net().replace('shape="10,3 110,3"', 'shape="10,3 10,103"'))
     (message,) = notes(network, Action.APPROXIMATED, "lane@joint")
@@ -610,6 +636,24 @@ BAD: dict[str, tuple[str | bytes, str]] = {
         "controls link 5",
     ),
     "neighbour": (GOOD.replace("></lane>", '><neigh lane="q"/></lane>', 1), "no lane 'q'"),
+    "no speed above 0": (GOOD.replace('speed="10"', 'speed="0"', 1), "speed='0' is not above 0"),
+    "negative speed": (GOOD.replace('speed="10"', 'speed="-3"', 1), "speed='-3' is not above 0"),
+    "no junction type": (
+        GOOD.replace('junction id=":j_2_0" type="internal"', 'junction id=":j_2_0"'),
+        "'type' is missing",
+    ),
+    "junction type": (
+        GOOD.replace('junction id=":j_2_0" type="internal"', 'junction id=":j_2_0" type="priority"'),
+        "incoming lane ':j_0_0' is inside a junction",
+    ),
+    "from inside": (
+        GOOD.replace('<edge id="w"', '<edge id="w" function="internal"'),
+        "incoming lane 'w_0' is inside a junction",
+    ),
+    "to inside": (
+        GOOD.replace('<edge id="e"', '<edge id="e" function="internal"'),
+        "leads to lane 'e_0' inside a junction",
+    ),
     "gzip": (gzip.compress(GOOD.encode())[:200], "damaged gzip"),
 }
 

@@ -769,6 +769,19 @@ class _Reader:
                 message = f"index {lane.index} taken as {position}, its place in the edge"
                 self.report.repaired("lane", lane.id, message, lane.element.sourceline)
                 lane.index = position
+        fastest = max(lane.speed for lane in edge.lanes)
+        for lane in edge.lanes:
+            if lane.speed <= 0.0:
+                if fastest <= 0.0:
+                    message = (
+                        f"speed='{lane.speed:g}' is not above 0, nor is that of another lane of its edge"
+                    )
+                    raise xml.error(lane.element, message)
+                message = (
+                    f"speed {lane.speed:g} m/s, taken as the {fastest:g} m/s of another lane of its edge"
+                )
+                self.report.repaired("lane", lane.id, message, lane.element.sourceline)
+                lane.speed = fastest
         self._ignore_children(element, "lane", "stopOffset")
         self._done(element, count=not bidi)
 
@@ -795,7 +808,7 @@ class _Reader:
             index=xml.integer(element, "index"),
             edge=edge,
             element=element,
-            speed=xml.number(element, "speed", minimum=0.0),
+            speed=xml.number(element, "speed"),
             length=xml.number(element, "length", minimum=0.0),
             width=xml.number(element, "width", DEFAULT_WIDTH),
             allowed=self._permissions(element),
@@ -941,7 +954,7 @@ class _Reader:
         links = {
             junction: self._links(junction, element)
             for junction, element in self.junction_elements.items()
-            if element.get("type") != "internal"
+            if self.xml.text(element, "type") != "internal"
         }
         chains = {id(c): self._chain(c) for found in links.values() for c in found}
         self._place_inside(links, chains)
@@ -992,9 +1005,17 @@ class _Reader:
             lane = self.lanes.get(lane_id)
             if lane is None:
                 raise self.xml.error(element, f"there is no incoming lane '{lane_id}'")
+            if lane.edge.function == "internal":
+                message = (
+                    f"incoming lane '{lane_id}' is inside a junction: only for junctions of type 'internal'"
+                )
+                raise self.xml.error(element, message)
             from_area = lane.edge.function == "walkingarea"
             for connection in lane.outgoing:
                 to = connection.target.edge.function
+                if to == "internal":
+                    message = f"leads to lane '{connection.target.id}' inside a junction: name it as 'via'"
+                    raise self.xml.error(connection.element, message)
                 if to != "walkingarea" and (not from_area or to == "crossing"):
                     links.append(connection)
         return links
@@ -1032,7 +1053,7 @@ class _Reader:
         for edge in self.edges.values():
             if edge.function in {"internal", "crossing", "walkingarea"} and edge.junction is None:
                 stem = edge.id.removeprefix(":").rpartition("_")[0]
-                if stem in self.junction_elements:
+                if stem in links:
                     edge.junction = stem
                 else:
                     message = "inside a junction, but no junction names it"
@@ -1389,8 +1410,14 @@ class _Reader:
                         f"{len(bits)} bits of {name}, but junction '{element.get('id')}' has {count} links"
                     )
                     raise self.xml.error(child, message)
+            itself = index in _bits(response) or index in _bits(foes)
+            if itself:
+                message = f"link {index} was its own foe; left out"
+                self.report.repaired("request", element.get("id"), message, child.sourceline)
+                at = count - 1 - index  # the last letter is index 0
+                response, foes = (f"{bits[:at]}0{bits[at + 1 :]}" for bits in (response, foes))
             rows[index] = response, foes, self.xml.flag(child, "cont")
-            self._done(child)
+            self._done(child, count=not itself)
         if not rows:
             if count and element.get("type") not in {"dead_end", "unregulated", "district", "rail_signal"}:
                 message = f"no requests for its {count} links: nobody has to yield"
