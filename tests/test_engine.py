@@ -211,3 +211,20 @@ def test_lateral_motion_is_the_quintic():
     assert f[0] == 0 and f[-1] == 1 and np.diff(f).min() > -1e-6
     np.testing.assert_allclose(slope.max(), 1.875, rtol=1e-3)
     np.testing.assert_allclose(np.abs(bend).max(), 5.7735, rtol=2e-2)
+
+
+def test_a_lane_change_that_the_lanes_ahead_cut_off_is_taken_back():
+    """The off-ramp parts from the motorway while a vehicle is on its way over."""
+    _, lane_map = bundled("ramp")
+    after, right = np.asarray(lane_map.routes.next_lane), np.asarray(lane_map.right)
+    cut_off = np.asarray(lane_map.may_change_right)[:, None] & (after >= 0) & (right[after] < 0)
+    row, goal = np.argwhere(cut_off)[0]
+    end = float(lane_map.length[row])
+    state = state_of([row], [end - 3.0], [6.0], [goal])
+    state = dataclasses.replace(
+        state, side=jnp.asarray([-1]), progress=jnp.asarray([0.2]), shift=jnp.asarray([3.5])
+    )
+    _, trace = runner("ramp", Traffic(lane_changes=False), 24)(state, drivers(1), shapes(1))
+    assert int(trace["lane"][-1, 0]) == after[row, goal], "it stays on its own way"
+    assert int(trace["side"][-1, 0]) == 0 and abs(float(trace["d"][-1, 0])) < 1e-3
+    assert np.abs(np.diff(np.asarray(trace["d"])[:, 0])).max() < 0.2, "and glides back"

@@ -67,7 +67,7 @@ def decide(
     v0, v_ahead, distance = _speeds(lane_map, driver, state, ahead)
     # changes to the left and to the right may start in turns, so nobody enters a gap from both sides
     side = jnp.where((state.step // config.decision_every) % 2 == 0, 1, -1)
-    beside, beside_s, allowed = place_beside(lane_map, shape, state, side)
+    beside, beside_s, allowed = place_beside(lane_map, driver, shape, state, side)
     other, other_s = other_lane(lane_map, state)
     n = state.lane.shape[0]
     found = neighbors(

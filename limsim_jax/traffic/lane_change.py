@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
+from limsim_jax.traffic.motion import CREEP_SPEED
 from limsim_jax.traffic.neighbors import Pair
 from limsim_jax.types import Driver, Shape, State
 
@@ -80,17 +81,23 @@ def incentive(
 
 
 def place_beside(
-    lane_map: LaneMap, shape: Shape, state: State, side: Int[Array, ""]
+    lane_map: LaneMap, driver: Driver, shape: Shape, state: State, side: Int[Array, ""]
 ) -> tuple[Int[Array, " N"], Float[Array, " N"], Bool[Array, " N"]]:
     """Lane and s (m) on the side (+1 left, -1 right) of every vehicle, and whether it may change there.
 
-    NO_LANE where it may not: by road marks, in junctions, by vehicle class, in the midst of a change.
+    NO_LANE where it may not: by road marks, in junctions, by vehicle class, in the midst of a change, or
+    too late to finish before the lanes part.
     """
     left = side > 0
     lane = jnp.where(left, lane_map.left[state.lane], lane_map.right[state.lane])
     allowed = jnp.where(left, lane_map.may_change_left[state.lane], lane_map.may_change_right[state.lane])
     usable = ((lane_map.access[lane] >> shape.vehicle_class) & 1) == 1
     allowed &= usable & state.active & (state.side == 0) & ~lane_map.is_connector[state.lane]
+    # time to finish before the lanes part
+    after = lane_map.routes.next_lane[state.lane, state.goal]
+    beside_after = jnp.where(left, lane_map.left[after], lane_map.right[after])
+    needed = jnp.maximum(state.v, CREEP_SPEED) * driver.lane_change_time
+    allowed &= (lane_map.length[state.lane] - state.s > needed) | (beside_after != NO_LANE)
     lane = jnp.where(allowed, lane, NO_LANE)
     return lane, side_s(lane_map, state.lane, state.s, side), allowed
 

@@ -132,9 +132,23 @@ def smooth_step(u: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return u * u * u * (10 + u * (-15 + 6 * u))
 
 
+def _turn_back(lane_map: LaneMap, state: State) -> State:
+    """Who changes to a lane that does not go on beside the own one returns to the middle of the own lane."""
+    beside = jnp.where(state.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
+    lost = state.active & (state.side != 0) & ~state.crossed & (beside == NO_LANE)
+    return replace(
+        state,
+        side=jnp.where(lost, -state.side, state.side),
+        crossed=state.crossed | lost,
+        progress=jnp.where(lost, 0, state.progress),
+        shift=jnp.where(lost, state.d, state.shift),
+    )
+
+
 @jax.named_scope("lane_change_motion")
 def _move_sideways(config: Config, lane_map: LaneMap, driver: Driver, state: State) -> State:
     """Go on with lane changes: d follows a quintic, and half-way the lane is the other one."""
+    state = _turn_back(lane_map, state)
     changing = state.active & (state.side != 0)
     rate = jnp.minimum(state.v / CREEP_SPEED, 1)
     done = state.progress + rate * safe_divide(jnp.full_like(rate, config.dt), driver.lane_change_time)
