@@ -629,7 +629,12 @@ def test_stop_line_and_crosswalk(read):
 def test_direct_junction(read):
     network = read(
         road("1", [section(0, [], [lane(-1), lane(-2)])], links=link("successor", "9", element="junction")),
-        road("2", [section(0, [], [lane(-1)])], x=100.0, links=link("predecessor", "1", "end")),
+        road(
+            "2",
+            [section(0, [], [lane(-1, links={"predecessor": -1})])],
+            x=100.0,
+            links=link("predecessor", "1", "end"),
+        ),
         road(
             "3",
             [section(0, [], [lane(-1)])],

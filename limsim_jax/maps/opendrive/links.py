@@ -88,7 +88,9 @@ class Linker:
         key = (a, b) if a <= b else (b, a)
         if a == b:
             return
-        self.contacts.setdefault(key, _Contact(*key, line, junction))
+        known = self.contacts.get(key)
+        if known is None or (known.junction is None and junction is not None):  # a road may say it, too
+            self.contacts[key] = _Contact(*key, line, junction)
 
     def _within(self, road: RawRoad) -> None:
         for k, section in enumerate(road.sections[:-1]):
@@ -116,8 +118,8 @@ class Linker:
             return
         other = self.roads[link.id]
         section = 0 if end == "start" else len(road.sections) - 1
-        lanes = road.sections[section].lanes
-        for number, lane in lanes.items():
+        contact = link.contact
+        for number, lane in road.sections[section].lanes.items():
             for target in lane.predecessors if end == "start" else lane.successors:
                 if not number or not target:
                     continue
@@ -125,7 +127,7 @@ class Linker:
                 if link.s is not None:
                     self._touch_inside(mine, other, target, link)
                     continue
-                contact = link.contact or self._nearest_end(road, end, other, where, link)
+                contact = contact or self._nearest_end(road, end, other, where, link)
                 index = 0 if contact == "start" else len(other.sections) - 1
                 self._touch(mine, (other.id, index, target, contact), lane.line)
 
