@@ -9,7 +9,8 @@ import pytest
 from traffic_worlds import bundled, scattered, shapes, state_of
 
 from limsim_jax.maps.lane_map import NO_LANE
-from limsim_jax.traffic.neighbors import ABSENT, neighbors, other_lane, place_of, sort_vehicles
+from limsim_jax.traffic.car_following import NO_GAP
+from limsim_jax.traffic.neighbors import neighbors, other_lane, place_of, sort_vehicles
 from limsim_jax.types import Config
 
 CONFIG = Config(dt=0.1)
@@ -28,7 +29,7 @@ def by_loop(lane_map, state, shape, lane, s, config=CONFIG):
                 entries.append((j, int(other[j]), float(other_s[j])))
     result = []
     for i in range(len(lane)):
-        lead, lead_gap, lag, lag_gap = -1, ABSENT, -1, ABSENT
+        lead, lead_gap, lag, lag_gap = -1, NO_GAP, -1, NO_GAP
         if lane[i] != NO_LANE:
             here, start = int(lane[i]), -float(s[i])
             for depth in range(config.look_ahead_lanes + 1):

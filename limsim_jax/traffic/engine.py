@@ -30,13 +30,13 @@ from limsim_jax.traffic.neighbors import (
 )
 from limsim_jax.types import Config, Driver, Shape, State, Status
 
-_BEND_POINTS = 4  # places ahead on the own lane at which the bend is looked at
 PATIENCE = 10.0
 """s of waiting at the end of a wrong lane before a driver gives up the route."""
 
 AT_END = 20.0
 """m from the end of a lane within which that counts."""
 
+_BEND_POINTS = 4  # places ahead on the own lane at which the bend is looked at
 _WALL = 1.0  # m before the end of a lane that leads nowhere
 _WALL_ROOM = 12.0  # m before it, kept free to change lanes from a standstill
 
@@ -121,9 +121,8 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
 
 
 def _stay(state: State) -> LaneChoice:
-    zero = jnp.zeros_like(state.side)
-    none = jnp.zeros_like(state.v)
-    return LaneChoice(zero, none, none, zero, zero - 1, none)
+    stay = jnp.zeros_like(state.side)
+    return LaneChoice(side=stay, letting=stay - 1, letting_gap=jnp.zeros_like(state.v))
 
 
 def _together(own: Pair, second: Pair, wall: Float[Array, " N"]) -> Obstacles:

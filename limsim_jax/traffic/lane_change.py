@@ -42,9 +42,6 @@ class LaneChoice(NamedTuple):
     """What a vehicle would do about its lane, from the present state alone."""
 
     side: Int[Array, " N"]  # +1 left, -1 right, 0 stay
-    incentive: Float[Array, " N"]  # m/s^2
-    urgency: Float[Array, " N"]  # 0..1
-    wanted: Int[Array, " N"]  # side that the route needs, 0 if none
     letting: Int[Array, " N"]  # slot of the vehicle that each one should let in, -1 for none
     letting_gap: Float[Array, " N"]  # m to it
 
@@ -189,9 +186,6 @@ def choose_lane(
     letting = jnp.where(letting_gap > 0, letting, -1)
     return LaneChoice(
         side=jnp.where(starts, side, 0),
-        incentive=advantage,
-        urgency=press,
-        wanted=wanted,
         letting=letting,
         letting_gap=letting_gap,
     )

@@ -92,7 +92,6 @@ def advance(
     lane, previous, s, left = _hand_over(lane_map, state, state.s + dx)
     state = replace(
         state,
-        step=state.step,
         lane=jnp.where(left, NO_LANE, lane),
         previous=jnp.where(left, NO_LANE, previous),
         s=jnp.where(left, 0, s),

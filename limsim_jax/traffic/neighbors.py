@@ -14,10 +14,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s
+from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.types import Config, Shape, State
-
-ABSENT = 1e6
-"""Gap (m) to a neighbour that is not there: far, but finite, so that gradients stay finite."""
 
 _POSITION_BITS = 18  # of a sort key: positions on a lane to 1 / 2^18 of its length
 _UPSTREAM = 2  # predecessors of a lane that are searched for followers
@@ -34,7 +32,7 @@ class Obstacles(NamedTuple):
     """What a vehicle must not run into: `K` others or standing obstacles, gaps at the decision."""
 
     other: Int[Array, "N K"]  # slot of the other vehicle, -1 for a standing obstacle
-    gap: Float[Array, "N K"]  # m, bumper to bumper; ABSENT if there is none
+    gap: Float[Array, "N K"]  # m, bumper to bumper; NO_GAP if there is none
 
 
 class Pair(NamedTuple):
@@ -188,14 +186,14 @@ def neighbors(
     vehicle, position = _entry(order, last, behind)
     vehicle = jnp.where(vehicle == me[..., None], -1, vehicle)
     distance = s[..., None] + lane_map.length[behind] - position
-    distance = jnp.where(vehicle >= 0, distance, ABSENT)
+    distance = jnp.where(vehicle >= 0, distance, NO_GAP)
     nearest = jnp.argmin(distance, -1)[..., None]
     upstream = (lag < 0) & (lane != NO_LANE)
     lag = jnp.where(upstream, jnp.take_along_axis(vehicle, nearest, -1)[..., 0], lag)
     lag_at = jnp.where(upstream, jnp.take_along_axis(distance, nearest, -1)[..., 0], lag_at)
     return Pair(
         lead,
-        jnp.where(lead >= 0, lead_gap, ABSENT),
+        jnp.where(lead >= 0, lead_gap, NO_GAP),
         lag,
-        jnp.where(lag >= 0, lag_at - shape.length[:, None], ABSENT),
+        jnp.where(lag >= 0, lag_at - shape.length[:, None], NO_GAP),
     )

@@ -175,6 +175,7 @@ class Cutter:
         self.report = report
         self.piece_at: dict[tuple[str, int], list[Piece]] = {}  # (road, section index) -> pieces, ascending
         self._wide: dict[tuple[str, int | None, float], list[int]] = {}
+        self._said: set[tuple[str, str]] = set()
 
     def pieces(self, road: RawRoad, extra: set[float]) -> list[Piece]:
         """The pieces of a road, ascending in s. `extra` are places where it has to be cut."""
@@ -394,7 +395,8 @@ class Cutter:
 
     def _once(self, action: str, element: str, where: str, message: str, line: int | None) -> None:
         """Report, but the same thing only once."""
-        if not any(n.where == where and n.message == message for n in self.report.notes):
+        if (where, message) not in self._said:
+            self._said.add((where, message))
             getattr(self.report, action)(element, where, message, line)
 
 
