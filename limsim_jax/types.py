@@ -1,7 +1,7 @@
 """What is fixed for a run (`Config`), for an episode (`Scenario`), and what a step changes (`State`).
 
-Shapes stand at the fields: `N` vehicle slots, `V` vehicles of a schedule, `O` origins. All types
-describe one world; a batch is a `vmap`. SI units, radians, counter-clockwise; `d > 0` is left.
+Shapes stand at the fields: `N` vehicle slots, `V` vehicles of a schedule, `O` origins, `E` egos. All
+types describe one world; a batch is a `vmap`. SI units, radians, counter-clockwise; `d > 0` is left.
 """
 
 from __future__ import annotations
@@ -73,10 +73,64 @@ class Status(enum.IntFlag):
 
 
 @struct.dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """Vehicles that enter from outside: sorted by origin, within an origin by time.
+
+    An origin is a queue in front of one lane: its vehicles enter in order, each when there is room.
+    Rows with `time` of infinity never enter (padding).
+    """
+
+    time: Float[Array, " V"]  # s, wants to enter
+    lane: Int[Array, " V"]
+    s: Float[Array, " V"]  # m, front bumper at entry
+    v: Float[Array, " V"]  # m/s, at entry; less where that would not be safe
+    goal: Int[Array, " V"]  # column of the route table
+    driver: Driver  # [V]
+    shape: Shape  # [V]
+    start: Int[Array, " O1"]  # rows start[o] .. start[o + 1] - 1 belong to origin o
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Queues:
+    """What has entered so far."""
+
+    next: Int[Array, " O"]  # row of the schedule that enters next, per origin
+    full: Int[Array, ""]  # departures that were due and safe, but no slot was free: counted every decision
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Lights:
+    """Where the signal programs are; `P` programs and, last, the one that is off."""
+
+    phase: Int[Array, " P"]
+    elapsed: Float[Array, " P"]  # s in this phase
+    gap: Float[Array, " P"]  # s since a vehicle was last seen on an approach that is green (actuated)
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Egos:
+    """Vehicles under test, `E` of them (maybe none). Lane, s, d, v, a of an ego are in its slot of `State`.
+
+    A `free` ego moves in the plane by a bicycle model, and its Frenet state follows from that; the others
+    keep to lanes as all traffic does, and their Cartesian state follows.
+    """
+
+    slot: Int[Array, " E"]
+    free: Bool[Array, " E"]
+    x: Float[Array, " E"]  # m, centre of the body
+    y: Float[Array, " E"]
+    heading: Float[Array, " E"]  # rad
+    steering: Float[Array, " E"]  # rad, angle of the front wheels, left > 0
+    a: Float[Array, " E"]  # m/s^2, of the drive train
+
+
+@struct.dataclass(frozen=True, kw_only=True)
 class State:
     """What a step changes. A slot that is not `active` holds harmless numbers."""
 
     step: Int[Array, ""]  # physics steps since the start
+    driver: Driver  # [N], of the vehicle in the slot
+    shape: Shape  # [N]
     active: Bool[Array, " N"]
     vehicle: Int[Array, " N"]  # row of the schedule, -1 for vehicles that were there at the start
     lane: Int[Array, " N"]
@@ -100,3 +154,17 @@ class State:
     distance: Float[Array, " N"]  # m since it entered
     entered: Float[Array, " N"]  # s, time of entry
     status: Int[Array, " N"]  # bits of `Status`
+    struck: Int[Array, " N"]  # slot of the first body that it touched, -1 for none
+    struck_at: Float[Array, " N"]  # s, when
+    # the rest of the world
+    queues: Queues
+    lights: Lights
+    egos: Egos
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """One episode: how it starts, and who comes later. `Egos` are part of the start."""
+
+    start: State
+    schedule: Schedule

@@ -27,9 +27,9 @@ def runner(name: str, traffic: Traffic, decisions: int):
     _, lane_map = bundled(name)
 
     @jax.jit
-    def run(state, driver, shape):
+    def run(state):
         def record(tick):
-            box = boxes(lane_map, driver, shape, tick.state)
+            box = boxes(lane_map, tick.state)
             n = box.shape[0]
             both = tick.state.active[:, None] & tick.state.active[None, :] & ~jnp.eye(n, dtype=bool)
             apart = jnp.where(both, separations(box, box), 99.0).min()
@@ -40,7 +40,7 @@ def runner(name: str, traffic: Traffic, decisions: int):
             }  # fmt: skip
 
         def decision(state, _):
-            return drive(CONFIG, traffic, lane_map, driver, shape, state, record)
+            return drive(CONFIG, traffic, lane_map, state, record)
 
         state, records = jax.lax.scan(decision, state, None, length=decisions)
         return state, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
@@ -61,11 +61,11 @@ def mixed(n, seed):
 def test_random_traffic_on_a_highway_is_sound(seed):
     n = 64
     network, lane_map = bundled("highway")
-    start = scattered("highway", n, seed)
     shape = dataclasses.replace(
         shapes(n), length=jnp.asarray(np.random.default_rng(seed).uniform(4, 12, n), jnp.float32)
     )
-    end, trace = runner("highway", Traffic(), 400)(start, mixed(n, seed), shape)
+    start = dataclasses.replace(scattered("highway", n, seed), driver=mixed(n, seed), shape=shape)
+    end, trace = runner("highway", Traffic(), 400)(start)
     trace = {name: np.asarray(value) for name, value in trace.items()}
     active = trace["active"]
     assert trace["apart"].min() > 0, "bodies overlap"
@@ -87,8 +87,8 @@ def test_random_traffic_on_a_highway_is_sound(seed):
 def test_lane_ends_and_exits_are_reached_without_overlap():
     """On-ramp and off-ramp: all get through, those that could not change in time too."""
     n = 64
-    start = scattered("ramp", n, 3)
-    end, trace = runner("ramp", Traffic(), 500)(start, mixed(n, 3), shapes(n))
+    start = dataclasses.replace(scattered("ramp", n, 3), driver=mixed(n, 3))
+    end, trace = runner("ramp", Traffic(), 500)(start)
     assert float(trace["apart"].min()) > 0
     assert int(end.active.sum()) == 0
     assert float(trace["a"].min()) >= -8.001
@@ -103,18 +103,20 @@ def platoon(model, n=6, v=20.0):
     driver = dataclasses.replace(
         drivers(n, T=1.5, b=2.0, a=1.4), v_max=jnp.asarray([v] + [60.0] * (n - 1), jnp.float32)
     )
-    state = state_of([row] * n, [600.0 - 40.0 * i for i in range(n)], [v] * n, [goal] * n)
-    return state, driver, Traffic(model=model, lane_changes=False)
+    state = state_of(
+        "highway", [row] * n, [600.0 - 40.0 * i for i in range(n)], [v] * n, [goal] * n, driver=driver
+    )
+    return state, Traffic(model=model, lane_changes=False)
 
 
 @pytest.mark.parametrize(("model", "exact"), [(ACC(), True), (IDM(), False)])
 def test_a_platoon_settles_at_the_equilibrium_gap(model, exact):
-    state, driver, traffic = platoon(model)
-    _, trace = runner("highway", traffic, 160)(state, driver, shapes(6))
+    state, traffic = platoon(model)
+    _, trace = runner("highway", traffic, 160)(state)
     gap = np.asarray(trace["s"][-1, :-1] - trace["s"][-1, 1:]) - 5.0
     v = np.asarray(trace["v"][-1])
     np.testing.assert_allclose(v, 20.0, atol=0.02)
-    free = np.asarray(driver.speed_factor * 120 / 3.6)[1:]
+    free = np.asarray(state.driver.speed_factor * 120 / 3.6)[1:]
     expected = 2.0 + 1.5 * 20.0
     if not exact:  # IDM: (s0 + v T) / sqrt(1 - (v / v0)^4)
         expected = expected / np.sqrt(1 - (20.0 / free) ** 4)
@@ -124,11 +126,11 @@ def test_a_platoon_settles_at_the_equilibrium_gap(model, exact):
 def test_slots_may_be_permuted():
     n = 24
     order = np.random.default_rng(0).permutation(n)
-    start, driver, shape = scattered("highway", n, 5), mixed(n, 5), shapes(n)
-    shuffled = jax.tree.map(lambda x: x[order] if jnp.ndim(x) else x, (start, driver, shape))
+    start = dataclasses.replace(scattered("highway", n, 5), driver=mixed(n, 5))
+    shuffled = jax.tree.map(lambda x: x[order] if jnp.shape(x) == (n,) else x, start)
     run = runner("highway", Traffic(), 40)
-    end, _ = run(start, driver, shape)
-    other, _ = run(*shuffled)
+    end, _ = run(start)
+    other, _ = run(shuffled)
     for name in ("lane", "s", "v", "d", "side"):
         np.testing.assert_array_equal(getattr(end, name)[order], getattr(other, name), err_msg=name)
 
@@ -136,13 +138,12 @@ def test_slots_may_be_permuted():
 def test_a_world_does_not_depend_on_its_companions():
     n = 24
     _, lane_map = bundled("highway")
-    driver, shape = mixed(n, 5), shapes(n)
-    states = [scattered("highway", n, seed) for seed in (5, 6, 7)]
+    states = [dataclasses.replace(scattered("highway", n, seed), driver=mixed(n, 5)) for seed in (5, 6, 7)]
 
     @jax.jit
     def run(state):
         step = lambda s: jax.lax.scan(  # noqa: E731
-            lambda c, _: drive(CONFIG, Traffic(), lane_map, driver, shape, c), s, None, length=20
+            lambda c, _: drive(CONFIG, Traffic(), lane_map, c), s, None, length=20
         )[0]
         return jax.vmap(step)(state)
 
@@ -153,18 +154,19 @@ def test_a_world_does_not_depend_on_its_companions():
 
 
 def test_gradients_are_those_of_finite_differences():
-    state, driver, traffic = platoon(ACC(), n=4)
+    state, traffic = platoon(ACC(), n=4)
     _, lane_map = bundled("highway")
     empty = dataclasses.replace(state, active=jnp.asarray([True, True, True, False]))
 
     def loss(T):
         def decision(state, _):
-            return drive(CONFIG, traffic, lane_map, dataclasses.replace(driver, T=T), shapes(4), state)
+            return drive(CONFIG, traffic, lane_map, state)
 
-        end, _ = jax.lax.scan(decision, empty, None, length=20)
+        start = dataclasses.replace(empty, driver=dataclasses.replace(state.driver, T=T))
+        end, _ = jax.lax.scan(decision, start, None, length=20)
         return jnp.sum(jnp.where(end.active, end.s, 0.0))
 
-    T = driver.T
+    T = state.driver.T
     gradient = jax.jit(jax.grad(loss))(T)
     assert np.isfinite(np.asarray(gradient)).all() and float(gradient[3]) == 0.0
     run = jax.jit(loss)
@@ -220,11 +222,11 @@ def test_a_lane_change_that_the_lanes_ahead_cut_off_is_taken_back():
     cut_off = np.asarray(lane_map.may_change_right)[:, None] & (after >= 0) & (right[after] < 0)
     row, goal = np.argwhere(cut_off)[0]
     end = float(lane_map.length[row])
-    state = state_of([row], [end - 3.0], [6.0], [goal])
+    state = state_of("ramp", [row], [end - 3.0], [6.0], [goal])
     state = dataclasses.replace(
         state, side=jnp.asarray([-1]), progress=jnp.asarray([0.2]), shift=jnp.asarray([3.5])
     )
-    _, trace = runner("ramp", Traffic(lane_changes=False), 24)(state, drivers(1), shapes(1))
+    _, trace = runner("ramp", Traffic(lane_changes=False), 24)(state)
     assert int(trace["lane"][-1, 0]) == after[row, goal], "it stays on its own way"
     assert int(trace["side"][-1, 0]) == 0 and abs(float(trace["d"][-1, 0])) < 1e-3
     assert np.abs(np.diff(np.asarray(trace["d"])[:, 0])).max() < 0.2, "and glides back"

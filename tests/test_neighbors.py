@@ -72,6 +72,7 @@ def test_neighbors_are_those_of_the_loop(name, n, seed):
     side = rng.integers(-1, 2, n)
     state = dataclasses.replace(
         state,
+        shape=shape,
         active=jnp.asarray(rng.random(n) < 0.9),
         side=jnp.asarray(side, jnp.int32),
         crossed=jnp.asarray(rng.random(n) < 0.5) & (jnp.asarray(side) != 0),
@@ -81,12 +82,12 @@ def test_neighbors_are_those_of_the_loop(name, n, seed):
     s = np.stack([state.s, state.s], -1)
 
     @jax.jit
-    def query(state, shape, lane, s):
+    def query(state, lane, s):
         order = sort_vehicles(lane_map, state)
         here = place_of(order, lane_map, lane, s)
-        return neighbors(CONFIG, lane_map, order, shape, state.goal, lane, s, here)
+        return neighbors(CONFIG, lane_map, order, state, lane, s, here)
 
-    pair = query(state, shape, jnp.asarray(lane), jnp.asarray(s))
+    pair = query(state, jnp.asarray(lane), jnp.asarray(s))
     found_any = 0
     for k in range(2):
         lead, lead_gap, lag, lag_gap = by_loop(lane_map, state, shape, lane[:, k], np.asarray(s[:, k]))
@@ -101,12 +102,12 @@ def test_neighbors_are_those_of_the_loop(name, n, seed):
 def test_nobody_sees_empty_slots_or_itself():
     _, lane_map = bundled("highway")
     goal = int(np.nonzero(np.asarray(lane_map.routes.reachable)[0])[0][0])
-    state = state_of([0, 0, 0], [100.0, 130.0, 160.0], [10.0] * 3, [goal] * 3, active=[True, False, True])
+    state = state_of(
+        "highway", [0, 0, 0], [100.0, 130.0, 160.0], [10.0] * 3, [goal] * 3, active=[True, False, True]
+    )
     order = sort_vehicles(lane_map, state)
     here = (order.rank[:3] + 1)[:, None]
-    pair = neighbors(
-        CONFIG, lane_map, order, shapes(3), state.goal, state.lane[:, None], state.s[:, None], here
-    )
+    pair = neighbors(CONFIG, lane_map, order, state, state.lane[:, None], state.s[:, None], here)
     assert pair.lead[:, 0].tolist()[::2] == [2, -1]
     assert pair.lag[:, 0].tolist()[::2] == [-1, 0]
     assert float(pair.lead_gap[0, 0]) == 55.0 and float(pair.lag_gap[2, 0]) == 55.0

@@ -10,6 +10,7 @@ import numpy as np
 from limsim_jax.maps import build_lane_map, bundled_map, load_map
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import Network
+from limsim_jax.traffic.demand import start_state
 from limsim_jax.types import Driver, Shape, State
 
 
@@ -40,17 +41,12 @@ def shapes(n: int, length: float = 5.0) -> Shape:
     )
 
 
-def state_of(lane, s, v, goal, active=None) -> State:
-    """Vehicles that keep their lanes."""
+def state_of(name, lane, s, v, goal, active=None, driver=None, shape=None) -> State:
+    """Vehicles that keep their lanes on a bundled map."""
     n = len(lane)
-    zero, zeros = jnp.zeros(n, jnp.float32), jnp.zeros(n, jnp.int32)
-    off = jnp.zeros(n, bool)
-    return State(
-        step=jnp.int32(0), active=jnp.ones(n, bool) if active is None else jnp.asarray(active),
-        vehicle=zeros - 1, lane=jnp.asarray(lane, jnp.int32), previous=zeros - 1,
-        s=jnp.asarray(s, jnp.float32), d=zero, v=jnp.asarray(v, jnp.float32), a=zero,
-        goal=jnp.asarray(goal, jnp.int32), side=zeros, crossed=off, progress=zero, shift=zero, rest=zero,
-        waiting=zero, held=off, stopped=off, distance=zero, entered=zero, status=zeros,
+    return start_state(
+        bundled(name)[1], drivers(n) if driver is None else driver, shapes(n) if shape is None else shape,
+        lane=jnp.asarray(lane), s=jnp.asarray(s), v=jnp.asarray(v), goal=jnp.asarray(goal), active=active,
     )  # fmt: skip
 
 
@@ -70,5 +66,5 @@ def scattered(name: str, n: int, seed: int, spacing: float = 30.0, v: float = 15
     goal = [rng.choice(np.nonzero(reachable[row])[0]) for row, _ in pick]
     jitter = rng.uniform(-5.0, 5.0, len(pick))
     return state_of(
-        [row for row, _ in pick], np.array([s for _, s in pick]) + jitter, np.full(len(pick), v), goal
+        name, [row for row, _ in pick], np.array([s for _, s in pick]) + jitter, np.full(len(pick), v), goal
     )

@@ -28,7 +28,7 @@ from limsim_jax.traffic.neighbors import (
     place_of,
     sort_vehicles,
 )
-from limsim_jax.types import Config, Driver, Shape, State, Status
+from limsim_jax.types import Config, State, Status
 
 PATIENCE = 10.0
 """s of waiting at the end of a wrong lane before a driver gives up the route."""
@@ -57,35 +57,30 @@ class Tick(NamedTuple):
 
 
 @jax.named_scope("decide")
-def decide(
-    config: Config, traffic: Traffic, lane_map: LaneMap, driver: Driver, shape: Shape, state: State
-) -> tuple[State, Decision]:
+def decide(config: Config, traffic: Traffic, lane_map: LaneMap, state: State) -> tuple[State, Decision]:
     """Look around once: leaders, bends, lane changes. Starts lane changes in the state."""
     state = _give_up(lane_map, state)
     order = sort_vehicles(lane_map, state)
     ahead = look_ahead(config, lane_map, state)
-    v0, v_ahead, distance = _speeds(lane_map, driver, state, ahead)
+    v0, v_ahead, distance = _speeds(lane_map, state, ahead)
     # changes to the left and to the right may start in turns, so nobody enters a gap from both sides
     side = jnp.where((state.step // config.decision_every) % 2 == 0, 1, -1)
-    beside, beside_s, allowed = place_beside(lane_map, driver, shape, state, side)
+    beside, beside_s, allowed = place_beside(lane_map, state, side)
     other, other_s = other_lane(lane_map, state)
     n = state.lane.shape[0]
     found = neighbors(
         config,
         lane_map,
         order,
-        shape,
-        state.goal,
+        state,
         jnp.stack([jnp.where(state.active, state.lane, NO_LANE), other, beside], -1),
         jnp.stack([state.s, other_s, beside_s], -1),
         jnp.stack([order.rank[:n] + 1, order.rank[n:] + 1, place_of(order, lane_map, beside, beside_s)], -1),
     )
     own, second, new = (jax.tree.map(lambda x: x[:, k], found) for k in range(3))  # noqa: B023
     if traffic.lane_changes:
-        choice = choose_lane(
-            traffic.model, lane_map, driver, shape, state, v0, own, new, beside, beside_s, allowed, side
-        )
-        state = start(lane_map, driver, state, choice)
+        choice = choose_lane(traffic.model, lane_map, state, v0, own, new, beside, beside_s, allowed, side)
+        state = start(lane_map, state, choice)
     else:
         choice = _stay(state)
     obstacles = _together(own, second, _lane_end(lane_map, state, ahead))
@@ -146,9 +141,10 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
 
 @jax.named_scope("speeds")
 def _speeds(
-    lane_map: LaneMap, driver: Driver, state: State, ahead: Ahead
+    lane_map: LaneMap, state: State, ahead: Ahead
 ) -> tuple[Float[Array, " N"], Float[Array, " N"], Float[Array, " N"]]:
     """Desired speed here, and the lower speed further on that asks for braking first, and how far it is."""
+    driver = state.driver
     v0 = desired_speed(driver, lane_map.speed_limit[state.lane], curvature(lane_map, state.lane, state.s))
     # lanes to come: limit and tightest bend
     lane = ahead.lane[:, 1:]
@@ -173,18 +169,16 @@ def drive(
     config: Config,
     traffic: Traffic,
     lane_map: LaneMap,
-    driver: Driver,
-    shape: Shape,
     state: State,
     record: object = None,
 ) -> tuple[State, object]:
     """One decision and the physics steps up to the next. `record(tick)` is stacked over the steps."""
-    state, decision = decide(config, traffic, lane_map, driver, shape, state)
+    state, decision = decide(config, traffic, lane_map, state)
 
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], object]:
         state, x = carry
-        a = accelerations(traffic.model, driver, state, decision, x)
-        state, dx, left = advance(config, lane_map, driver, state, a)
+        a = accelerations(traffic.model, state, decision, x)
+        state, dx, left = advance(config, lane_map, state, a)
         state = replace(state, step=state.step + 1)
         out = None if record is None else record(Tick(state, left))  # pyright: ignore[reportCallIssue]
         return (state, x + dx), out

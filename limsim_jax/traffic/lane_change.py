@@ -17,7 +17,7 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
 from limsim_jax.traffic.motion import CREEP_SPEED
 from limsim_jax.traffic.neighbors import Pair
-from limsim_jax.types import Driver, Shape, State
+from limsim_jax.types import State
 
 ROUTE_BASE, ROUTE_URGENT = 0.5, 4.0
 """m/s^2, incentive for a change that the route needs: at no, and at full urgency."""
@@ -78,7 +78,7 @@ def incentive(
 
 
 def place_beside(
-    lane_map: LaneMap, driver: Driver, shape: Shape, state: State, side: Int[Array, ""]
+    lane_map: LaneMap, state: State, side: Int[Array, ""]
 ) -> tuple[Int[Array, " N"], Float[Array, " N"], Bool[Array, " N"]]:
     """Lane and s (m) on the side (+1 left, -1 right) of every vehicle, and whether it may change there.
 
@@ -88,12 +88,12 @@ def place_beside(
     left = side > 0
     lane = jnp.where(left, lane_map.left[state.lane], lane_map.right[state.lane])
     allowed = jnp.where(left, lane_map.may_change_left[state.lane], lane_map.may_change_right[state.lane])
-    usable = ((lane_map.access[lane] >> shape.vehicle_class) & 1) == 1
+    usable = ((lane_map.access[lane] >> state.shape.vehicle_class) & 1) == 1
     allowed &= usable & state.active & (state.side == 0) & ~lane_map.is_connector[state.lane]
     # time to finish before the lanes part
     after = lane_map.routes.next_lane[state.lane, state.goal]
     beside_after = jnp.where(left, lane_map.left[after], lane_map.right[after])
-    needed = jnp.maximum(state.v, CREEP_SPEED) * driver.lane_change_time
+    needed = jnp.maximum(state.v, CREEP_SPEED) * state.driver.lane_change_time
     allowed &= (lane_map.length[state.lane] - state.s > needed) | (beside_after != NO_LANE)
     lane = jnp.where(allowed, lane, NO_LANE)
     return lane, side_s(lane_map, state.lane, state.s, side), allowed
@@ -103,8 +103,6 @@ def place_beside(
 def choose_lane(
     model: CarFollowing,
     lane_map: LaneMap,
-    driver: Driver,
-    shape: Shape,
     state: State,
     v0: Float[Array, " N"],
     own: Pair,
@@ -120,7 +118,7 @@ def choose_lane(
     vehicles choose from the same state. Two that enter the same gap come from the same lane and keep
     the distance that they have.
     """
-
+    driver, shape = state.driver, state.shape
     me = jnp.arange(state.lane.shape[0], dtype=jnp.int32)
     routes = lane_map.routes
     to_go = routes.lanes_to_go[state.lane, state.goal]
@@ -191,7 +189,7 @@ def choose_lane(
     )
 
 
-def start(lane_map: LaneMap, driver: Driver, state: State, choice: LaneChoice) -> State:
+def start(lane_map: LaneMap, state: State, choice: LaneChoice) -> State:
     """Begin the lane changes that were chosen."""
     begins = choice.side != 0
     beside = jnp.where(choice.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
@@ -204,5 +202,5 @@ def start(lane_map: LaneMap, driver: Driver, state: State, choice: LaneChoice) -
         crossed=state.crossed & ~begins,
         progress=jnp.where(begins, 0, state.progress),
         shift=jnp.where(begins, shift, state.shift),
-        rest=jnp.where(begins, REST + driver.lane_change_time, state.rest),
+        rest=jnp.where(begins, REST + state.driver.lane_change_time, state.rest),
     )

@@ -17,7 +17,7 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, width
 from limsim_jax.numerics import safe_divide
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing, ballistic, per_obstacle
 from limsim_jax.traffic.neighbors import Obstacles
-from limsim_jax.types import Config, Driver, Shape, State, Status
+from limsim_jax.types import Config, State, Status
 
 WALKING_SPEED = 1.5
 """m/s, below which a vehicle counts as waiting."""
@@ -46,9 +46,10 @@ COURTESY = 2.0
 
 @jax.named_scope("accelerations")
 def accelerations(
-    model: CarFollowing, driver: Driver, state: State, decision: Decision, x: Float[Array, " N"]
+    model: CarFollowing, state: State, decision: Decision, x: Float[Array, " N"]
 ) -> Float[Array, " N"]:
     """Acceleration (m/s^2) of every vehicle, `x` m after the decision: the least that any obstacle asks."""
+    driver = state.driver
     index, gap0 = decision.obstacles
     moving = index >= 0
 
@@ -77,7 +78,6 @@ def accelerations(
 def advance(
     config: Config,
     lane_map: LaneMap,
-    driver: Driver,
     state: State,
     a: Float[Array, " N"],
 ) -> tuple[State, Float[Array, " N"], Bool[Array, " N"]]:
@@ -88,7 +88,7 @@ def advance(
     a = jnp.where(state.active, a, 0)
     v, dx = ballistic(state.v, a, config.dt)
     realised = (v - state.v) / config.dt
-    hard = realised < -driver.b_max - 0.01
+    hard = realised < -state.driver.b_max - 0.01
     lane, previous, s, left = _hand_over(lane_map, state, state.s + dx)
     state = replace(
         state,
@@ -103,7 +103,7 @@ def advance(
         rest=jnp.maximum(state.rest - config.dt, 0),
         status=state.status | jnp.where(hard & state.active, int(Status.HARD_BRAKE), 0),
     )
-    return _move_sideways(config, lane_map, driver, state), dx, left
+    return _move_sideways(config, lane_map, state), dx, left
 
 
 def _hand_over(
@@ -145,12 +145,12 @@ def _turn_back(lane_map: LaneMap, state: State) -> State:
 
 
 @jax.named_scope("lane_change_motion")
-def _move_sideways(config: Config, lane_map: LaneMap, driver: Driver, state: State) -> State:
+def _move_sideways(config: Config, lane_map: LaneMap, state: State) -> State:
     """Go on with lane changes: d follows a quintic, and half-way the lane is the other one."""
     state = _turn_back(lane_map, state)
     changing = state.active & (state.side != 0)
     rate = jnp.minimum(state.v / CREEP_SPEED, 1)
-    done = state.progress + rate * safe_divide(jnp.full_like(rate, config.dt), driver.lane_change_time)
+    done = state.progress + rate * safe_divide(jnp.full_like(rate, config.dt), state.driver.lane_change_time)
     progress = jnp.where(changing, jnp.minimum(done, 1), 0)
     offset = state.shift * (1 - smooth_step(progress))  # from the centre of the lane that it moves to
     beside = jnp.where(state.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
@@ -180,24 +180,25 @@ def _move_sideways(config: Config, lane_map: LaneMap, driver: Driver, state: Sta
     )
 
 
-def lateral_speed(driver: Driver, state: State) -> Float[Array, " N"]:
+def lateral_speed(state: State) -> Float[Array, " N"]:
     """Speed across the lane, m/s, of vehicles that change lanes."""
     u = jnp.clip(state.progress, 0, 1)
     slope = 30 * u * u * (1 - u) * (1 - u)
-    rate = safe_divide(jnp.minimum(state.v / CREEP_SPEED, 1), driver.lane_change_time)
+    rate = safe_divide(jnp.minimum(state.v / CREEP_SPEED, 1), state.driver.lane_change_time)
     return jnp.where(state.side != 0, -state.shift * slope * rate, 0)
 
 
-def boxes(lane_map: LaneMap, driver: Driver, shape: Shape, state: State) -> Float[Array, "N 5"]:
+def boxes(lane_map: LaneMap, state: State) -> Float[Array, "N 5"]:
     """Oriented boxes: x, y (m) of the centre, heading (rad), length, width (m).
 
     The body lies on the lane at its centre, half a length behind the front bumper, which may be on the
     lane before; it is turned by the direction of its motion.
     """
+    shape = state.shape
     s = state.s - shape.length / 2
     behind = (s < 0) & (state.previous != NO_LANE)
     lane = jnp.where(behind, state.previous, state.lane)
     s = jnp.where(behind, s + lane_map.length[state.previous], s)
     x, y, heading = pose(lane_map, lane, s, state.d)
-    turned = jnp.arctan2(lateral_speed(driver, state), jnp.maximum(state.v, 0.5))
+    turned = jnp.arctan2(lateral_speed(state), jnp.maximum(state.v, 0.5))
     return jnp.stack([x, y, heading + turned, shape.length, shape.width], -1)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s
 from limsim_jax.traffic.car_following import NO_GAP
-from limsim_jax.types import Config, Shape, State
+from limsim_jax.types import Config, State
 
 _POSITION_BITS = 18  # of a sort key: positions on a lane to 1 / 2^18 of its length
 _UPSTREAM = 2  # predecessors of a lane that are searched for followers
@@ -133,8 +133,7 @@ def neighbors(
     config: Config,
     lane_map: LaneMap,
     order: Order,
-    shape: Shape,
-    goal: Int[Array, " N"],
+    state: State,
     lane: Int[Array, "N K"],
     s: Float[Array, "N K"],
     here: Int[Array, "N K"],
@@ -149,7 +148,8 @@ def neighbors(
     Without a lane there is nobody.
     """
     me = jnp.arange(lane.shape[0], dtype=jnp.int32)[:, None]
-    goal = jnp.broadcast_to(goal[:, None], lane.shape)
+    goal = jnp.broadcast_to(state.goal[:, None], lane.shape)
+    length = state.shape.length
 
     lanes, starts = [], []
     start, after = lane_map.length[lane] - s, lane
@@ -175,7 +175,7 @@ def neighbors(
         new = (lead < 0) & (vehicle[..., k] >= 0)
         lead = jnp.where(new, vehicle[..., k], lead)
         lead_at = jnp.where(new, offset[..., k] + position[..., k], lead_at)
-    lead_gap = lead_at - shape.length[lead]
+    lead_gap = lead_at - length[lead]
     lead = jnp.where(lead_gap < config.look_ahead, lead, -1)
 
     # follower: the entry before, else the first vehicle on a lane that leads here
@@ -195,5 +195,5 @@ def neighbors(
         lead,
         jnp.where(lead >= 0, lead_gap, NO_GAP),
         lag,
-        jnp.where(lag >= 0, lag_at - shape.length[:, None], NO_GAP),
+        jnp.where(lag >= 0, lag_at - length[:, None], NO_GAP),
     )
