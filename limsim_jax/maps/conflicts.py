@@ -19,7 +19,7 @@ from typing import Any, cast
 import flax.struct
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.sparse import csr_array
@@ -76,6 +76,8 @@ class ConflictTable:
     length: Float[Array, " K"]  # m
     wait_s: Float[Array, " K"]  # m from here along the movement, where to wait for foes inside; 0: nowhere
     clear_s: Float[Array, " K"]  # m, end of the last crossing or merging stretch; 0 without any
+    cross_s: Float[Array, " K"]  # m, end of the last crossing stretch, to be kept clear; 0 without any
+    must_stop: Bool[Array, " K"]  # begins at a stop sign
     foe: Int[Array, "K C"]  # connector
     s_in: Float[Array, "K C"]  # m, the stretch on the connector itself
     s_out: Float[Array, "K C"]
@@ -205,11 +207,15 @@ def build_conflicts(
         t = 0 if p else t
         entries[overlap.first].append((overlap, p, t))
         entries[overlap.second].append((overlap.mirrored(), -p, -t))
-    num, slots = len(lanes) + 1, max([1, *map(len, entries)])
+    num, slots = len(lanes) + 1, max([0, *map(len, entries)])
     floats = {name: np.full((num, slots), ABSENT, np.float32) for name in ("s_in", "s_out", "f_in", "f_out")}
     ints = {name: np.zeros((num, slots), np.int32) for name in ("foe", "type", "prio", "tie")}
     ints["foe"][:] = -1
-    clear_s = np.zeros(num, np.float32)
+    clear_s, cross_s = np.zeros(num, np.float32), np.zeros(num, np.float32)
+    must_stop = np.zeros(num, bool)
+    for way in network.movements:
+        if way.via and way.via[0] in index:
+            must_stop[index[way.via[0]]] |= way.control in (Control.STOP, Control.ALL_WAY_STOP)
     for k, row in enumerate(entries):
         row.sort(key=lambda entry: (entry[0].s_in, entry[0].s_out, entry[0].second))
         for c, (overlap, p, t) in enumerate(row):
@@ -218,6 +224,7 @@ def build_conflicts(
             ints["foe"][k, c], ints["type"][k, c] = overlap.second, overlap.type
             ints["prio"][k, c], ints["tie"][k, c] = p, t
         clear_s[k] = max([o.s_out for o, _, _ in row if o.type is not ConflictType.DIVERGE], default=0.0)
+        cross_s[k] = max([o.s_out for o, _, _ in row if o.type is ConflictType.CROSS], default=0.0)
 
     connector = np.full(len(rows) + 1, -1, np.int32)
     for lane_id, k in index.items():
@@ -229,6 +236,8 @@ def build_conflicts(
         length=np.array([lane.length for lane in lanes] + [1.0], np.float32),
         wait_s=np.array([*_waiting_points(network, lanes, entries, right_of_way), 0.0], np.float32),
         clear_s=clear_s,
+        cross_s=cross_s,
+        must_stop=must_stop,
         **floats,
         **ints,
     )

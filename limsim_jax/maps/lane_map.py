@@ -68,6 +68,9 @@ REACH = 10.0
 TURN_WINDOW = 4.0
 """`curvature_max` is the mean over a stretch of this length, m: about a wheelbase and a half."""
 
+MIN_WIDTH = 2.7
+"""m, of a lane on which any vehicle finds room: a bus is 2.55 m wide."""
+
 _CELL = 8.0  # m, side of the cells that `project` looks up
 _CHUNK_LENGTH, _CHUNK_TURN = 32.0, 0.6  # m, rad: a candidate of `project` has at most about one closest point
 _JUMP = 1.5e-3  # m: closer host samples are a kink or a step
@@ -85,7 +88,7 @@ _LEAST = {  # least sizes of tables, so that all small maps have the same shapes
     "cells": 1024,
     "candidates": 8192,
     "connectors": 64,
-    "foes": 16,
+    "foes": 0,
     "goals": 16,
     "programs": 16,
     "phases": 16,
@@ -108,6 +111,7 @@ class LaneMap:
     length: Float[Array, " L"]  # m
     speed_limit: Float[Array, " L"]  # m/s
     stop_s: Float[Array, " L"]  # m, where the front bumper stops: last stop line, else end of the lane
+    end_s: Float[Array, " L"]  # m, as far as a vehicle can go on a lane that leads nowhere: it may taper off
     curvature_max: Float[Array, " L"]  # 1/m, largest |mean curvature| over any `TURN_WINDOW`
     left: Int[Array, " L"]  # neighbour in the same direction
     right: Int[Array, " L"]
@@ -405,8 +409,10 @@ def lane_ids(network: Network) -> list[str]:
 
 
 def bucket(count: int, least: int = 1) -> int:
-    """Least of 1, 2, 3, 4, 6, 8, 12, 16, 24, ... that is below neither `count` nor `least`."""
+    """Least of 0, 1, 2, 3, 4, 6, 8, 12, 16, 24, ... that is below neither `count` nor `least`."""
     count = max(count, least)
+    if count == 0:
+        return 0
     power = 1 << (count - 1).bit_length()
     return 3 * power // 4 if power >= 4 and count <= 3 * power // 4 else power
 
@@ -454,6 +460,7 @@ def build_lane_map(
         "length": 1.0,
         "speed_limit": 1.0,
         "stop_s": 1.0,
+        "end_s": 1.0,
     }
     tables |= {
         "first": raster.first,
@@ -559,6 +566,7 @@ def _lane_tables(network: Network, lanes: list[Lane]) -> dict[str, NDArray[Any]]
     return {
         "speed_limit": np.array([lane.speed_limit for lane in lanes], float),
         "stop_s": stop_s,
+        "end_s": np.array([_wide_until(lane) for lane in lanes]),
         "left": left,
         "right": right,
         "opposite": np.array([row_of(lane, lane.opposite) for lane in lanes]),
@@ -574,6 +582,14 @@ def _lane_tables(network: Network, lanes: list[Lane]) -> dict[str, NDArray[Any]]
         "junction": np.array([junctions.get(lane.junction or "", -1) for lane in lanes]),
         "valid": np.ones(len(lanes), bool),
     }
+
+
+def _wide_until(lane: Lane) -> float:
+    """m from the start to where a lane without successors becomes too narrow; its length if it does not."""
+    wide = np.nonzero(lane.width >= MIN_WIDTH)[0]
+    if lane.successors or not len(wide) or wide[-1] == len(lane.width) - 1:
+        return lane.length
+    return float(lane.s[wide[-1]])
 
 
 @dataclass(frozen=True)

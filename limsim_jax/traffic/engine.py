@@ -15,19 +15,21 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, turn_speed
+from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
 from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, start
 from limsim_jax.traffic.motion import Decision, accelerations, advance
 from limsim_jax.traffic.neighbors import (
     Ahead,
     Obstacles,
-    Pair,
     look_ahead,
     neighbors,
     other_lane,
     place_of,
     sort_vehicles,
 )
+from limsim_jax.traffic.right_of_way import give_way, rows_ahead
+from limsim_jax.traffic.signals import switch
 from limsim_jax.types import Config, State, Status
 
 PATIENCE = 10.0
@@ -83,7 +85,15 @@ def decide(config: Config, traffic: Traffic, lane_map: LaneMap, state: State) ->
         state = start(lane_map, state, choice)
     else:
         choice = _stay(state)
-    obstacles = _together(own, second, _lane_end(lane_map, state, ahead))
+    rows = rows_ahead(config, lane_map, state, ahead)
+    lights = switch(config, lane_map, state, rows.lane, rows.line)
+    yielding = give_way(lane_map, state, rows, own, lane_states(lane_map.signals, lights.phase))
+    state = replace(state, lights=lights, held=yielding.held, stopped=yielding.stopped)
+    wall = jnp.minimum(_lane_end(lane_map, state, ahead), yielding.stop + state.driver.s0)
+    obstacles = Obstacles(
+        jnp.stack([own.lead, second.lead, yielding.lead, jnp.full_like(own.lead, -1)], -1),
+        jnp.stack([own.lead_gap, second.lead_gap, yielding.lead_gap, wall], -1),
+    )
     return state, Decision(
         obstacles=obstacles,
         v0=v0,
@@ -120,22 +130,16 @@ def _stay(state: State) -> LaneChoice:
     return LaneChoice(side=stay, letting=stay - 1, letting_gap=jnp.zeros_like(state.v))
 
 
-def _together(own: Pair, second: Pair, wall: Float[Array, " N"]) -> Obstacles:
-    nobody = jnp.full_like(own.lead, -1)
-    return Obstacles(
-        jnp.stack([own.lead, second.lead, nobody], -1),
-        jnp.stack([own.lead_gap, second.lead_gap, wall], -1),
-    )
-
-
 def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N"]:
     """Metres to where the way ends before the goal: the end of a lane that the route does not leave."""
     goal = state.goal[:, None]
     at_goal = lane_map.routes.is_goal[ahead.lane, goal]
     stuck = (lane_map.routes.next_lane[ahead.lane, goal] == NO_LANE) & ~at_goal & (ahead.lane != NO_LANE)
+    # who is on its way out may use the taper; others keep room to start from a standstill
     end = ahead.start + lane_map.length[ahead.lane] - _WALL
-    room = end - (_WALL_ROOM - _WALL)
-    end = jnp.where((state.side == 0)[:, None] & (room > 0), room, end)
+    wide = ahead.start + lane_map.end_s[ahead.lane] - _WALL
+    room = wide - (_WALL_ROOM - _WALL)
+    end = jnp.where((state.side == 0)[:, None], jnp.where(room > 0, room, wide), end)
     return jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
 
 
@@ -183,6 +187,12 @@ def drive(
         out = None if record is None else record(Tick(state, left))  # pyright: ignore[reportCallIssue]
         return (state, x + dx), out
 
-    x = jnp.zeros_like(state.s)
+    before, x = state.lane, jnp.zeros_like(state.s)
     (state, _), records = lax.scan(step, (state, x), None, length=config.decision_every)
-    return state, records
+    shows = lane_states(lane_map.signals, state.lights.phase)
+    entered = (state.lane != before) & state.active
+    ran = entered & (
+        (shows[state.lane] == SignalState.RED)
+        | (shows[state.previous] == SignalState.RED) & (state.previous != before)
+    )
+    return replace(state, status=state.status | jnp.where(ran, int(Status.RED_LIGHT), 0)), records

@@ -34,6 +34,9 @@ COURTEOUS = 0.6
 REST = 4.0
 """s from the end of a lane change to the start of the next voluntary one."""
 
+SLOWEST = 4.0
+"""m/s, speed assumed of a vehicle in a jam when it asks whether it could still change back."""
+
 ROOM = 0.5
 """m, least gap to the new leader and follower."""
 
@@ -122,7 +125,8 @@ def choose_lane(
     me = jnp.arange(state.lane.shape[0], dtype=jnp.int32)
     routes = lane_map.routes
     to_go = routes.lanes_to_go[state.lane, state.goal]
-    room = routes.change_distance[state.lane, state.goal] - state.s
+    taper = (lane_map.length - lane_map.end_s)[state.lane]
+    room = routes.change_distance[state.lane, state.goal] - taper - state.s
     press = urgency(to_go, room, state.v, driver.lane_change_time)
     wanted = jnp.sign(to_go)
     reachable = routes.reachable[lane, state.goal]
@@ -159,8 +163,11 @@ def choose_lane(
         old_then=jnp.where(old, old_then, 0),
         politeness=driver.politeness * (1 - press),
     )
-    with_route = (wanted * side).astype(advantage.dtype)
-    advantage += with_route * jnp.where(wanted != 0, ROUTE_BASE + ROUTE_URGENT * press, 0)
+    # a lane on the wanted side may still lead nowhere: the change may be possible only further on
+    farther = routes.distance[lane, state.goal] > routes.distance[state.lane, state.goal]
+    towards = (wanted == side) & ~farther
+    with_route = jnp.where(towards, 1, jnp.where(wanted * side < 0, -1, 0)).astype(advantage.dtype)
+    advantage += with_route * (ROUTE_BASE + ROUTE_URGENT * press)
     advantage -= side.astype(advantage.dtype) * driver.keep_right
 
     # safety (eq. 2): nobody has to brake harder than b_safe, and there is room
@@ -169,15 +176,15 @@ def choose_lane(
         (pair.lead < 0) | ((own_then > -b_safe) & (pair.lead_gap > ROOM))
     )
     # a change away from the route must leave time to come back, and none is begun that the lane cannot hold
-    away = (wanted * side < 0) | ((wanted == 0) & (routes.lanes_to_go[lane, state.goal] != 0))
+    away = (wanted * side < 0) | ((wanted == side) & farther) | ((wanted == 0) & (routes.lanes_to_go[lane, state.goal] != 0))
     back = routes.change_distance[lane, state.goal] - s
     count = jnp.abs(routes.lanes_to_go[lane, state.goal]).astype(back.dtype)
-    late = away & (back < 3 * state.v * driver.lane_change_time * (count + 1))
+    late = away & (back < 3 * jnp.maximum(state.v, SLOWEST) * driver.lane_change_time * (count + 1))
     rested = (state.rest <= 0) | (press > 0)
     starts = allowed & reachable & safe & ~late & rested & (advantage > driver.threshold)
 
     # courtesy: the vehicle that would be the new follower of somebody in need lets it in
-    asks = (wanted == side) & (press > COURTEOUS) & allowed & follower & ~starts
+    asks = towards & (press > COURTEOUS) & allowed & follower & ~starts
     n = me.shape[0]
     letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(asks, pair.lag, n)].max(me)[:n]
     letting_gap = jnp.where(letting >= 0, pair.lag_gap[letting], NO_GAP)

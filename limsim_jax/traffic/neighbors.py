@@ -154,7 +154,9 @@ def neighbors(
     lanes, starts = [], []
     start, after = lane_map.length[lane] - s, lane
     for _ in range(config.look_ahead_lanes):
-        after = lane_map.routes.next_lane[after, goal]
+        following = lane_map.routes.next_lane[after, goal]
+        # where the way ends, tails of vehicles that drive on may still be in front
+        after = jnp.where(following == NO_LANE, lane_map.successors[after, 0], following)
         lanes.append(after)
         starts.append(start)
         start = start + lane_map.length[after]

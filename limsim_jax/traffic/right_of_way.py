@@ -1,0 +1,399 @@
+"""Who goes first where paths meet, and where the others wait: lights, signs, priority, gaps.
+
+Every vehicle looks at the next two connectors on its way: the one it is on, and those it comes to. For
+every conflict of a connector it looks at the vehicles on the foe that have not passed yet. Of two
+vehicles exactly one goes first, and both see it alike, because both evaluate the same function of the
+same state with the roles swapped:
+
+1. who is on the stretch goes before who is not, who can no longer stop before who can;
+2. else the one with priority (the map's, and that of the light; between equals right before left, who
+   waits longer, who comes first), unless the other has time to pass: a gap of `GAP_LEAD` seconds in front
+   of it, or it is kept back and does not come;
+3. who does not go first waits at the stop line, or lets the other clear the stretch, or where paths
+   merge follows the other as its leader.
+
+Gap acceptance follows the windows of entry and exit times of Krajzewicz & Erdmann, SUMO's junction model
+(2013), with the driver's `gap_factor`. Waiting makes impatient: gaps shrink by up to 60 % in a minute.
+Highway Capacity Manual 6th ed., ch. 20: critical gaps of 4 to 7 s.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from limsim_jax.maps.conflicts import ConflictType
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, turn_speed
+from limsim_jax.maps.signals import SignalState
+from limsim_jax.traffic.car_following import NO_GAP
+from limsim_jax.traffic.neighbors import Ahead, Pair
+from limsim_jax.types import Config, Driver, State
+
+GAP_LEAD = 1.5
+"""s between the own exit of a stretch and the entry of a vehicle with priority, for a `gap_factor` of 1."""
+
+GAP_FOLLOW = 0.5
+"""s between the exit of the vehicle that goes first and the own entry."""
+
+BRAKE = 4.0
+"""m/s^2: who would have to brake harder to wait counts as one who goes."""
+
+YELLOW_BRAKE = 3.0
+"""m/s^2: who can stop with this stops at yellow."""
+
+WAITED = 3.0
+"""s of waiting of both, after which right before left no longer holds: who waits longer goes."""
+
+STUCK = 20.0
+"""s of waiting of both, after which priority no longer holds: who waits longer goes."""
+
+_ROWS = 2  # connectors ahead that a vehicle looks at
+_FOES = 3  # vehicles per conflict
+_BEHIND = 160.0  # m before a connector that still count as coming to it
+_BITS = 18  # of a sort key, for the position along the connector
+_MARGIN = 0.5  # m between the front bumper and what it waits at
+_STANDS = 1.0  # m/s, below which the vehicle ahead counts as standing
+
+
+class Rows(NamedTuple):
+    """The next connectors of every vehicle, `R` of them."""
+
+    connector: Int[Array, "N R"]  # -1 where there is none
+    lane: Int[Array, "N R"]
+    x: Float[Array, "N R"]  # m, front bumper along the connector; negative before it
+    line: Float[Array, "N R"]  # m to the place to wait before the junction; negative once passed
+
+
+class Yielding(NamedTuple):
+    """What the right of way asks of every vehicle."""
+
+    stop: Float[Array, " N"]  # m to where the front bumper has to stop, NO_GAP if nowhere
+    lead: Int[Array, " N"]  # slot of a vehicle to follow through a merge or a split, -1 for none
+    lead_gap: Float[Array, " N"]  # m to it
+    held: Bool[Array, " N"]  # kept before a junction, not by a light
+    stopped: Bool[Array, " N"]  # has stopped at the stop sign ahead
+
+
+def rows_ahead(config: Config, lane_map: LaneMap, state: State, ahead: Ahead) -> Rows:
+    """The first connectors on the way of every vehicle, from its own lane on."""
+    table = lane_map.conflicts
+    connector = jnp.where(state.active[:, None], table.connector[ahead.lane], -1)
+    connector = jnp.where(ahead.start < config.look_ahead, connector, -1)
+    count = jnp.cumsum(connector >= 0, -1)
+    junction = lane_map.junction[ahead.lane]
+    setback = (lane_map.length - lane_map.stop_s)[ahead.lane]
+    rows, line = [], jnp.full_like(state.s, -NO_GAP)
+    inside = jnp.full_like(state.lane, -1)
+    for r in range(_ROWS):
+        here = (connector >= 0) & (count == r + 1)
+        index = jnp.argmax(here, -1)[:, None]
+        found = here.any(-1)
+        pick = lambda x, i: jnp.take_along_axis(x, i, -1)[:, 0]  # noqa: E731
+        start, which = pick(ahead.start, index), pick(junction, index)
+        before = jnp.maximum(index - 1, 0)
+        enters = (index[:, 0] > 0) & (which >= 0) & (pick(junction, before) != which)
+        # the line of a junction holds for all its connectors; who is inside has none, nor has a lane outside
+        line = jnp.where(
+            enters, start - pick(setback, before), jnp.where((which >= 0) & (which == inside), line, -NO_GAP)
+        )
+        inside = which
+        rows.append(
+            (
+                jnp.where(found, pick(connector, index), -1),
+                jnp.where(found, pick(ahead.lane, index), NO_LANE),
+                jnp.where(found, -start, -NO_GAP),
+                jnp.where(found, line, -NO_GAP),
+            )
+        )
+    return Rows(*(jnp.stack(column, -1) for column in zip(*rows, strict=True)))
+
+
+def travel_time(
+    distance: Float[Array, "*#b"], v: Float[Array, "*#b"], v_end: Float[Array, "*#b"], a: Float[Array, "*#b"]
+) -> Float[Array, "*b"]:
+    """Seconds to cover `distance` m from speed `v`, accelerating with `a` up to `v_end >= v`."""
+    distance = jnp.maximum(distance, 0)
+    v_end = jnp.maximum(v_end, 0.1)
+    reached = jnp.minimum(jnp.sqrt(v * v + 2 * a * distance + 1e-9), v_end)
+    room = (v_end * v_end - v * v) / (2 * a)
+    return jnp.maximum(reached - v, 0) / a + jnp.maximum(distance - room, 0) / v_end
+
+
+class _Sight(NamedTuple):
+    """What others can tell about a vehicle on its way over a connector."""
+
+    y: Array  # m, front bumper along the connector
+    length: Array
+    v: Array
+    fast: Array  # m/s, the speed it may reach
+    slow: Array  # m/s, the speed it has to keep to
+    a: Array
+    brake: Array  # m, to stop with BRAKE
+    wait: Array  # s
+    line: Array  # m to the stop line
+    stuck: Array  # 1 if kept by a light, a full exit or a queue
+    held: Array  # 1 if kept by the right of way at the last decision
+    major: Array  # 1 if the light gives priority, -1 if it takes it
+    slot: Array
+
+
+@jax.named_scope("right_of_way")
+def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, shows: Int[Array, " L"]) -> Yielding:
+    """Where every vehicle has to wait, and whom it follows through merges and splits.
+
+    Args:
+      lane_map: where.
+      state: the world.
+      rows: the connectors to come.
+      own: leader and follower on the own way.
+      shows: what the light at the entry of every lane shows, `SignalState`.
+    """
+    table, driver = lane_map.conflicts, state.driver
+    n = state.lane.shape[0]
+    brake = state.v * state.v / (2 * BRAKE)
+
+    at_light, major = _lights(state, rows, shows)
+    full = _exit_full(lane_map, state, rows, own)
+    standing = (own.lead >= 0) & (state.v[own.lead] < _STANDS) & (state.v < _STANDS)
+    queued = standing & (own.lead_gap < 2 * driver.s0 + 1)
+    sign, stopped = _stop_sign(lane_map, state, rows)
+
+    def everywhere(x: Array) -> Array:
+        return jnp.broadcast_to(x[:, None] if x.ndim == 1 else x, (n, _ROWS)).astype(jnp.float32)
+
+    speed = turn_speed(lane_map, rows.lane, driver.a_lat[:, None])
+    a = jnp.maximum(driver.a, 0.5)
+    sight = _Sight(
+        y=rows.x,
+        length=everywhere(state.shape.length),
+        v=everywhere(state.v),
+        fast=jnp.maximum(state.v[:, None], speed),
+        slow=speed,
+        a=everywhere(a),
+        brake=everywhere(brake),
+        wait=everywhere(state.waiting),
+        line=rows.line,
+        stuck=everywhere((at_light < NO_GAP) | full | queued[:, None]),
+        held=everywhere(state.held),
+        major=major.astype(jnp.float32),
+        slot=everywhere(jnp.arange(n)),
+    )
+    if table.foe.shape[1]:
+        s_in, blocked, lead, lead_gap = _meet(lane_map, state, rows, sight)
+    else:
+        nothing = jnp.zeros((n, _ROWS, 0))
+        s_in, blocked = nothing, nothing > 0
+        lead, lead_gap = jnp.full(n, -1, jnp.int32), jnp.full(n, NO_GAP, jnp.float32)
+    stop, waiting = _where_to_stop(table.wait_s[rows.connector], rows, sight, s_in, blocked, sign | full)
+    held = state.active & waiting.any(-1)
+    stop = jnp.minimum(stop, at_light).min(-1)
+    return Yielding(
+        stop=jnp.where(state.active, stop, NO_GAP),
+        lead=lead,
+        lead_gap=lead_gap,
+        held=held,
+        stopped=stopped,
+    )
+
+
+def _meet(lane_map: LaneMap, state: State, rows: Rows, sight: _Sight) -> tuple[Array, Array, Array, Array]:
+    """Every conflict of every row: `s_in` and whether it is taken, [N, R, C]; whom to follow, at what gap."""
+    table, driver = lane_map.conflicts, state.driver
+    n = state.lane.shape[0]
+    # tails that are still on the connector behind
+    tail = table.connector[state.previous]
+    tail = jnp.where(state.active & (state.s < state.shape.length), tail, -1)
+    first = jax.tree.map(lambda x: x[:, 0], sight)
+    first = first._replace(y=state.s + lane_map.length[state.previous], line=jnp.full_like(state.s, -NO_GAP))
+    entries = jax.tree.map(lambda x, t: jnp.concatenate([x, t[:, None]], -1).ravel(), sight, first)
+    connector = jnp.concatenate([rows.connector, tail[:, None]], -1).ravel()
+
+    size, count = table.length.shape[0], connector.shape[0]
+
+    def key(k: Array, x: Array) -> Array:
+        part = jnp.clip((x + _BEHIND) / (table.length[k] + _BEHIND), 0, 1) * (2**_BITS - 1)
+        row = jnp.where(k < 0, size, k).astype(jnp.uint32)
+        return (row << _BITS) | part.astype(jnp.uint32)
+
+    order, entry = lax.sort(
+        (key(connector, entries.y - entries.length), jnp.arange(count, dtype=jnp.int32)), num_keys=1
+    )
+    placed = connector[entry]
+    facts = jnp.stack(entries, -1)[entry]  # rows of one vehicle each lie together in memory
+
+    # for every conflict: the vehicles on the foe that have not cleared the stretch, the nearest first
+    k = rows.connector
+    foe, kind = table.foe[k], table.type[k]  # [N, R, C]
+    s_in, s_out, f_in, f_out = (x[k] for x in (table.s_in, table.s_out, table.f_in, table.f_out))
+    splits = kind == ConflictType.DIVERGE
+    x = rows.x[..., None]
+    place = jnp.searchsorted(order, key(foe, jnp.where(splits, x, f_out)), method="scan_unrolled")
+    place = place[..., None] + jnp.where(
+        splits[..., None], jnp.asarray([-1, 0, 1]), jnp.asarray([-1, -2, -3])
+    )
+    safe = jnp.clip(place, 0, count - 1)
+    there = (place >= 0) & (place < count) & (placed[safe] == foe[..., None]) & (foe[..., None] >= 0)
+    other = _Sight(*jnp.moveaxis(facts[safe], -1, 0))  # [N, R, C, Q]
+    me = jax.tree.map(lambda x: x[..., None, None], sight)
+    there &= (other.slot != me.slot) & (k >= 0)[..., None, None]
+
+    wide = lambda x: x[..., None]  # noqa: E731
+    mine, theirs = _Way(wide(s_in), wide(s_out)), _Way(wide(f_in), wide(f_out))
+    merges = wide(kind == ConflictType.MERGE)
+    prio, tie = wide(table.prio[k]), wide(table.tie[k])
+    gap_me = _gap(driver, state)[:, None, None, None]
+    gap_foe = _gap(driver, state)[other.slot.astype(jnp.int32)]
+    first = _goes_first(me, mine, gap_me, other, theirs, gap_foe, prio, tie, merges)
+
+    distance_in = wide(s_in) - me.y
+    past = wide(s_out) + me.length - me.y <= 0
+    waits = there & ~first & ~past & ~wide(splits)
+    # a vehicle that clears the stretch before one comes there needs no care
+    out = travel_time(
+        wide(f_out) + other.length - other.y, jnp.minimum(other.v, other.slow), other.slow, 0.7 * other.a
+    )
+    soon = travel_time(distance_in, me.v, me.fast, me.a)
+    waits &= ~((out + GAP_FOLLOW < soon) & (other.stuck == 0) & ~merges)
+    # merging: behind the other, as soon as there is room behind it
+    behind = (wide(s_out) - me.y) - (wide(f_out) - other.y + other.length)
+    room = (driver.s0 + 0.5 * driver.T * state.v)[:, None, None, None]
+    follows = waits & merges & ((behind > room) | (distance_in <= 0))
+    blocked = (waits & ~follows).any(-1)  # [N, R, C]
+
+    # splits: who is ahead on the other way, until its rear is clear
+    ahead_of = other.y - other.length - me.y
+    in_front = there & wide(splits) & (other.y > jnp.maximum(me.y, 0)) & (other.y - other.length < wide(f_out))
+    in_front &= ~past
+    gap = jnp.where(follows, behind, jnp.where(in_front, ahead_of, NO_GAP)).reshape(n, -1)
+    need = gap + (other.v * other.v / (2 * driver.b[:, None, None, None])).reshape(n, -1)
+    nearest = jnp.argmin(jnp.where(gap < NO_GAP, need, 2 * NO_GAP), -1)[:, None]
+    lead_gap = jnp.take_along_axis(gap, nearest, -1)[:, 0]
+    lead = jnp.take_along_axis(other.slot.reshape(n, -1), nearest, -1)[:, 0].astype(jnp.int32)
+    return s_in, blocked, jnp.where(lead_gap < NO_GAP, lead, -1), lead_gap
+
+
+class _Way(NamedTuple):
+    """A stretch on a connector."""
+
+    start: Array
+    end: Array
+
+
+def _gap(driver: Driver, state: State) -> Float[Array, " N"]:
+    """s that a driver keeps in front of a vehicle with priority; impatience makes it smaller."""
+    impatience = jnp.clip((state.waiting - 5) / 60, 0, 1)
+    return GAP_LEAD * driver.gap_factor * (1 - 0.6 * impatience)
+
+
+def _goes_first(
+    me: _Sight,
+    mine: _Way,
+    gap_me: Array,
+    foe: _Sight,
+    theirs: _Way,
+    gap_foe: Array,
+    prio: Array,
+    tie: Array,
+    merges: Array,
+) -> Array:
+    """Whether `me` goes before `foe`: the negation of the same with the roles swapped."""  # fmt: skip
+    in_me, in_foe = mine.start - me.y, theirs.start - foe.y
+    level_me = (in_me <= 0).astype(jnp.int32) + (in_me < me.brake)
+    level_foe = (in_foe <= 0).astype(jnp.int32) + (in_foe < foe.brake)
+    soon_me, soon_foe = travel_time(in_me, me.v, me.fast, me.a), travel_time(in_foe, foe.v, foe.fast, foe.a)
+    before = me.slot < foe.slot
+    # both inside, or both unable to stop: who is further on
+    left_me, left_foe = mine.end - me.y, theirs.end - foe.y
+    nearer = jnp.where(left_me == left_foe, before, left_me < left_foe)
+    sooner = jnp.where(soon_me == soon_foe, before, soon_me < soon_foe)
+    forced = jnp.where(level_me == 2, nearer, sooner)
+
+    # between those who can still choose: who has priority
+    longer = jnp.where(me.wait == foe.wait, sooner, me.wait > foe.wait)
+    both = jnp.minimum(me.wait, foe.wait)
+    rank = jnp.where((tie != 0) & (both < WAITED), tie > 0, longer)
+    light = jnp.sign(me.major - foe.major)
+    order = jnp.where(light != 0, light, prio)
+    kept = (me.held > 0) & (foe.held > 0) & (both > STUCK)
+    major = jnp.where(kept, longer, jnp.where(order != 0, order > 0, rank))
+    # and whether the other has the time to pass before
+    i_pass = _passes(me, mine, gap_me, foe, soon_foe, merges)
+    foe_passes = _passes(foe, theirs, gap_foe, me, soon_me, merges)
+    free = jnp.where(major, ~foe_passes, i_pass)
+    return jnp.where(level_me != level_foe, level_me > level_foe, jnp.where(level_me > 0, forced, free))
+
+
+def _passes(minor: _Sight, way: _Way, gap: Array, major: _Sight, soon: Array, merges: Array) -> Array:
+    """Whether `minor` takes the gap in front of `major`, which would arrive in `soon` s."""
+    start = jnp.minimum(minor.v, minor.slow)
+    a = 0.8 * minor.a
+    # merging, it has to be in front by its length; crossing, to have left
+    distance = jnp.where(merges, way.start, way.end) - minor.y + minor.length
+    out = travel_time(distance, start, minor.slow, a)
+    speed = jnp.minimum(jnp.sqrt(start * start + 2 * a * jnp.maximum(distance, 0)), minor.slow)
+    slower = jnp.maximum(major.v - speed, 0)
+    loss = jnp.where(merges, slower * slower / (4 * jnp.maximum(major.v, 1)), 0)  # major brakes with 2 m/s^2
+    gap = jnp.where(minor.line < 0, 0.3 * gap, gap)  # who has entered goes on
+    comes_not = (major.stuck > 0) | ((major.held > 0) & (minor.held == 0))
+    return (minor.stuck == 0) & (comes_not | (out + gap + loss < soon))
+
+
+def _lights(state: State, rows: Rows, shows: Int[Array, " L"]) -> tuple[Array, Array]:
+    """m to the line where a light says stop, else NO_GAP; and what the light says of priority, [N, R]."""
+    light = shows[rows.lane]
+    brake = state.v * state.v
+    yellow = (light == SignalState.YELLOW) & (brake[:, None] <= 2 * YELLOW_BRAKE * jnp.maximum(rows.line, 0))
+    at_red = (light == SignalState.RED) | (light == SignalState.RED_YELLOW)
+    # who cannot stop any more drives on
+    red = at_red & (brake[:, None] <= 2 * 0.9 * state.driver.b_max[:, None] * jnp.maximum(rows.line, 0))
+    stops = (yellow | red) & (rows.line > -_MARGIN) & (rows.connector >= 0)
+    minor = (light == SignalState.GREEN_MINOR) | (light == SignalState.STOP)
+    major = jnp.where(light == SignalState.GREEN_MAJOR, 1, jnp.where(minor, -1, 0))
+    left_over = (rows.line < -_MARGIN) & (at_red | (light == SignalState.YELLOW))  # clears the junction first
+    return jnp.where(stops, rows.line - _MARGIN, NO_GAP), jnp.where(left_over, 2, major)
+
+
+def _exit_full(lane_map: LaneMap, state: State, rows: Rows, own: Pair) -> Bool[Array, "N R"]:
+    """Keep clear: whether a vehicle would come to stand where others cross."""
+    clear = lane_map.conflicts.cross_s[rows.connector]
+    needed = clear - rows.x + state.shape.length[:, None] + state.driver.s0[:, None]
+    slow = (own.lead >= 0) & (state.v[own.lead] < _STANDS)
+    room = own.lead_gap + 2 * state.v[own.lead]
+    return (clear > 0) & slow[:, None] & (room[:, None] < needed) & (rows.line > -_MARGIN)
+
+
+def _stop_sign(lane_map: LaneMap, state: State, rows: Rows) -> tuple[Bool[Array, "N R"], Bool[Array, " N"]]:
+    """Whether a stop sign still has to be obeyed, and who has stopped at the one ahead."""
+    sign = lane_map.conflicts.must_stop[rows.connector] & (rows.line > -_MARGIN)
+    near = rows.line[:, 0] < 2.5
+    stopped = sign[:, 0] & (state.stopped | ((state.v < 0.3) & near))
+    return sign & ~jnp.stack([stopped, jnp.zeros_like(stopped)], -1), stopped
+
+
+def _where_to_stop(
+    wait_s: Float[Array, "N R"],
+    rows: Rows,
+    sight: _Sight,
+    s_in: Float[Array, "N R C"],
+    blocked: Bool[Array, "N R C"],
+    barred: Bool[Array, "N R"],
+) -> tuple[Float[Array, "N R"], Bool[Array, "N R"]]:
+    """m to where the front bumper waits, NO_GAP if it need not; and whether that is before the conflicts."""
+    x = rows.x
+    until = (
+        jnp.min(jnp.where(blocked, s_in - x[..., None], NO_GAP), -1, initial=NO_GAP) - _MARGIN
+    )  # the first stretch that is taken
+    inside = (wait_s > 0) & (wait_s - x > -_MARGIN)
+    beyond = inside & (until >= wait_s - x)  # all that is taken lies beyond the waiting point
+    until = jnp.where(beyond & (until < NO_GAP - 1), jnp.maximum(wait_s - x, 0), until)
+    # before the line, unless the line is too near
+    at_line = (rows.line > -_MARGIN) & (rows.line + _MARGIN > sight.brake)
+    taken = until < NO_GAP / 2
+    line = jnp.maximum(rows.line - _MARGIN, 0)
+    stop = jnp.where(taken, jnp.where(at_line & ~beyond, jnp.minimum(line, until), until), NO_GAP)
+    stop = jnp.where(barred & at_line, jnp.minimum(stop, line), stop)
+    return stop, (taken | barred) & (at_line | beyond)
