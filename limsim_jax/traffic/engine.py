@@ -136,10 +136,11 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
     at_goal = lane_map.routes.is_goal[ahead.lane, goal]
     stuck = (lane_map.routes.next_lane[ahead.lane, goal] == NO_LANE) & ~at_goal & (ahead.lane != NO_LANE)
     # who is on its way out may use the taper; others keep room to start from a standstill
+    stopping = (state.v * state.v / (2 * state.driver.b))[:, None]
     end = ahead.start + lane_map.length[ahead.lane] - _WALL
     wide = ahead.start + lane_map.end_s[ahead.lane] - _WALL
     room = wide - (_WALL_ROOM - _WALL)
-    end = jnp.where((state.side == 0)[:, None], jnp.where(room > 0, room, wide), end)
+    end = jnp.where((state.side == 0)[:, None], jnp.where(room > stopping, room, wide), end)
     return jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
 
 
@@ -179,20 +180,26 @@ def drive(
     """One decision and the physics steps up to the next. `record(tick)` is stacked over the steps."""
     state, decision = decide(config, traffic, lane_map, state)
 
+    # what no step changes stays out of the loop
+    fixed = {name: getattr(state, name) for name in ("driver", "shape", "vehicle", "lights", "queues")}
+
+    def bare(state: State) -> State:
+        return replace(state, **dict.fromkeys(fixed))
+
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], object]:
         state, x = carry
+        state = replace(state, **fixed)
         a = accelerations(traffic.model, state, decision, x)
         state, dx, left = advance(config, lane_map, state, a)
         state = replace(state, step=state.step + 1)
         out = None if record is None else record(Tick(state, left))  # pyright: ignore[reportCallIssue]
-        return (state, x + dx), out
+        return (bare(state), x + dx), out
 
     before, x = state.lane, jnp.zeros_like(state.s)
-    (state, _), records = lax.scan(step, (state, x), None, length=config.decision_every)
+    (state, _), records = lax.scan(step, (bare(state), x), None, length=config.decision_every)
+    state = replace(state, **fixed)
     shows = lane_states(lane_map.signals, state.lights.phase)
     entered = (state.lane != before) & state.active
-    ran = entered & (
-        (shows[state.lane] == SignalState.RED)
-        | (shows[state.previous] == SignalState.RED) & (state.previous != before)
-    )
+    red = shows == SignalState.RED
+    ran = entered & (red[state.lane] | (red[state.previous] & (state.previous != before)))
     return replace(state, status=state.status | jnp.where(ran, int(Status.RED_LIGHT), 0)), records

@@ -54,6 +54,8 @@ STUCK = 20.0
 _ROWS = 2  # connectors ahead that a vehicle looks at
 _FOES = 3  # vehicles per conflict
 _BEHIND = 160.0  # m before a connector that still count as coming to it
+_PAIRS = 2  # conflicts that are looked at, per slot; more at once make vehicles wait
+_EASY = 2.0  # m/s^2, braking from which conflicts ahead matter
 _BITS = 18  # of a sort key, for the position along the connector
 _MARGIN = 0.5  # m between the front bumper and what it waits at
 _STANDS = 1.0  # m/s, below which the vehicle ahead counts as standing
@@ -183,12 +185,11 @@ def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, shows: Int[
         slot=everywhere(jnp.arange(n)),
     )
     if table.foe.shape[1]:
-        s_in, blocked, lead, lead_gap = _meet(lane_map, state, rows, sight)
-    else:
-        nothing = jnp.zeros((n, _ROWS, 0))
-        s_in, blocked = nothing, nothing > 0
+        until, lead, lead_gap = _meet(lane_map, state, rows, sight)
+    else:  # a map where paths never meet
+        until = jnp.full((n, _ROWS), NO_GAP, jnp.float32)
         lead, lead_gap = jnp.full(n, -1, jnp.int32), jnp.full(n, NO_GAP, jnp.float32)
-    stop, waiting = _where_to_stop(table.wait_s[rows.connector], rows, sight, s_in, blocked, sign | full)
+    stop, waiting = _where_to_stop(table.wait_s[rows.connector], rows, sight, until, sign | full)
     held = state.active & waiting.any(-1)
     stop = jnp.minimum(stop, at_light).min(-1)
     return Yielding(
@@ -200,80 +201,101 @@ def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, shows: Int[
     )
 
 
-def _meet(lane_map: LaneMap, state: State, rows: Rows, sight: _Sight) -> tuple[Array, Array, Array, Array]:
-    """Every conflict of every row: `s_in` and whether it is taken, [N, R, C]; whom to follow, at what gap."""
+def _meet(
+    lane_map: LaneMap, state: State, rows: Rows, sight: _Sight
+) -> tuple[Float[Array, "N R"], Int[Array, " N"], Float[Array, " N"]]:
+    """All conflicts at once: m to the first stretch that is taken (NO_GAP: none), whom to follow, the gap.
+
+    Few of the conflicts of a map matter to a vehicle at a time: those that it comes to soon and that
+    somebody else comes to. These, at most `_PAIRS` per slot, are put together before they are looked at.
+    """
     table, driver = lane_map.conflicts, state.driver
-    n = state.lane.shape[0]
+    n, size, slots = state.lane.shape[0], table.length.shape[0], table.foe.shape[1]
     # tails that are still on the connector behind
     tail = table.connector[state.previous]
     tail = jnp.where(state.active & (state.s < state.shape.length), tail, -1)
     first = jax.tree.map(lambda x: x[:, 0], sight)
     first = first._replace(y=state.s + lane_map.length[state.previous], line=jnp.full_like(state.s, -NO_GAP))
-    entries = jax.tree.map(lambda x, t: jnp.concatenate([x, t[:, None]], -1).ravel(), sight, first)
+    entries = _Sight(*(jnp.concatenate([x, t[:, None]], -1).ravel() for x, t in zip(sight, first, strict=True)))
     connector = jnp.concatenate([rows.connector, tail[:, None]], -1).ravel()
-
-    size, count = table.length.shape[0], connector.shape[0]
+    count = connector.shape[0]
 
     def key(k: Array, x: Array) -> Array:
         part = jnp.clip((x + _BEHIND) / (table.length[k] + _BEHIND), 0, 1) * (2**_BITS - 1)
         row = jnp.where(k < 0, size, k).astype(jnp.uint32)
         return (row << _BITS) | part.astype(jnp.uint32)
 
-    order, entry = lax.sort(
-        (key(connector, entries.y - entries.length), jnp.arange(count, dtype=jnp.int32)), num_keys=1
-    )
-    placed = connector[entry]
-    facts = jnp.stack(entries, -1)[entry]  # rows of one vehicle each lie together in memory
+    places = jnp.arange(count, dtype=jnp.int32)
+    order, entry = lax.sort((key(connector, entries.y - entries.length), places), num_keys=1)
 
-    # for every conflict: the vehicles on the foe that have not cleared the stretch, the nearest first
+    # which conflicts matter
     k = rows.connector
-    foe, kind = table.foe[k], table.type[k]  # [N, R, C]
-    s_in, s_out, f_in, f_out = (x[k] for x in (table.s_in, table.s_out, table.f_in, table.f_out))
-    splits = kind == ConflictType.DIVERGE
-    x = rows.x[..., None]
-    place = jnp.searchsorted(order, key(foe, jnp.where(splits, x, f_out)), method="scan_unrolled")
-    place = place[..., None] + jnp.where(
-        splits[..., None], jnp.asarray([-1, 0, 1]), jnp.asarray([-1, -2, -3])
-    )
-    safe = jnp.clip(place, 0, count - 1)
-    there = (place >= 0) & (place < count) & (placed[safe] == foe[..., None]) & (foe[..., None] >= 0)
-    other = _Sight(*jnp.moveaxis(facts[safe], -1, 0))  # [N, R, C, Q]
-    me = jax.tree.map(lambda x: x[..., None, None], sight)
-    there &= (other.slot != me.slot) & (k >= 0)[..., None, None]
+    busy = jnp.zeros(size, bool).at[jnp.where(connector < 0, size, connector)].set(True, mode="drop")
+    reach = rows.x + (state.v * state.v / (2 * _EASY) + 1.5 * state.v + 12)[:, None]
+    near = (table.s_in[k] < reach[..., None]) & (table.s_out[k] > (rows.x - sight.length)[..., None])
+    matters = (near & busy[table.foe[k]] & (table.foe[k] >= 0) & (k >= 0)[..., None]).reshape(n * _ROWS, slots)
+    number = matters.sum(-1, dtype=jnp.int32)
+    begin = jnp.cumsum(number) - number
+    most = _PAIRS * n
+    pair = jnp.arange(most, dtype=jnp.int32)
+    row = jnp.searchsorted(begin, pair, side="right", method="scan_unrolled").astype(jnp.int32) - 1
+    upto = matters.astype(jnp.float32) @ jnp.triu(jnp.ones((slots, slots), jnp.float32))
+    nth = (pair - begin[row]).astype(jnp.float32)
+    c = (upto[row] <= nth[:, None]).sum(-1, dtype=jnp.int32)
+    exists = (pair < begin[-1] + number[-1]) & (c < slots)
+    c = jnp.minimum(c, slots - 1)
+    vehicle, k = row // _ROWS, k.ravel()[row]
+    missed = (number > 0) & (begin + number > most)  # no room in the list: better wait
 
-    wide = lambda x: x[..., None]  # noqa: E731
-    mine, theirs = _Way(wide(s_in), wide(s_out)), _Way(wide(f_in), wide(f_out))
-    merges = wide(kind == ConflictType.MERGE)
-    prio, tie = wide(table.prio[k]), wide(table.tie[k])
-    gap_me = _gap(driver, state)[:, None, None, None]
-    gap_foe = _gap(driver, state)[other.slot.astype(jnp.int32)]
-    first = _goes_first(me, mine, gap_me, other, theirs, gap_foe, prio, tie, merges)
+    # for each: the vehicles on the foe that have not cleared the stretch, the nearest first
+    foe, kind = table.foe[k, c], table.type[k, c]
+    s_in, s_out, f_in, f_out = (x[k, c][:, None] for x in (table.s_in, table.s_out, table.f_in, table.f_out))
+    splits, merges = (kind == ConflictType.DIVERGE)[:, None], (kind == ConflictType.MERGE)[:, None]
+    me = _Sight(*(x.ravel()[row][:, None] for x in sight))
+    wanted = key(foe, jnp.where(splits, me.y, f_out)[:, 0])
+    place = jnp.searchsorted(order, wanted, method="scan_unrolled")[:, None]
+    place = place + jnp.where(splits, jnp.arange(_FOES) - 1, -1 - jnp.arange(_FOES))
+    index = entry[jnp.clip(place, 0, count - 1)]  # [P, Q]
+    there = (place >= 0) & (place < count) & (connector[index] == foe[:, None]) & exists[:, None]
+    other = _Sight(*(x[index] for x in entries))
+    there &= other.slot != me.slot
 
-    distance_in = wide(s_in) - me.y
-    past = wide(s_out) + me.length - me.y <= 0
-    waits = there & ~first & ~past & ~wide(splits)
+    mine, theirs = _Way(s_in, s_out), _Way(f_in, f_out)
+    gaps = _gap(driver, state)
+    first = _goes_first(
+        me, mine, gaps[vehicle][:, None], other, theirs, gaps[other.slot.astype(jnp.int32)],
+        table.prio[k, c][:, None], table.tie[k, c][:, None], merges,
+    )  # fmt: skip
+
+    distance_in = s_in - me.y
+    past = s_out + me.length - me.y <= 0
+    waits = there & ~first & ~past & ~splits
     # a vehicle that clears the stretch before one comes there needs no care
-    out = travel_time(
-        wide(f_out) + other.length - other.y, jnp.minimum(other.v, other.slow), other.slow, 0.7 * other.a
-    )
+    way = f_out + other.length - other.y
+    out = travel_time(way, jnp.minimum(other.v, other.slow), other.slow, 0.7 * other.a)
     soon = travel_time(distance_in, me.v, me.fast, me.a)
     waits &= ~((out + GAP_FOLLOW < soon) & (other.stuck == 0) & ~merges)
-    # merging: behind the other, as soon as there is room behind it
-    behind = (wide(s_out) - me.y) - (wide(f_out) - other.y + other.length)
-    room = (driver.s0 + 0.5 * driver.T * state.v)[:, None, None, None]
-    follows = waits & merges & ((behind > room) | (distance_in <= 0))
-    blocked = (waits & ~follows).any(-1)  # [N, R, C]
+    # merging: behind the other where there is room behind it, and where that asks for less than to stop
+    behind = (s_out - me.y) - (f_out - other.y + other.length)
+    s0, T, b = (x[vehicle][:, None] for x in (driver.s0, driver.T, driver.b))
+    reach = behind + other.v * other.v / (2 * b)
+    follows = waits & merges & (((behind > s0 + 0.5 * T * me.v) & (reach > distance_in)) | (distance_in <= 0))
+    taken = (waits & ~follows).any(-1)
+    until = jnp.where(taken, distance_in[:, 0], NO_GAP)
+    until = jnp.full(n * _ROWS, NO_GAP, jnp.float32).at[row].min(until)
+    until = jnp.where(missed, jnp.minimum(until, 0), until).reshape(n, _ROWS)
 
     # splits: who is ahead on the other way, until its rear is clear
-    ahead_of = other.y - other.length - me.y
-    in_front = there & wide(splits) & (other.y > jnp.maximum(me.y, 0)) & (other.y - other.length < wide(f_out))
-    in_front &= ~past
-    gap = jnp.where(follows, behind, jnp.where(in_front, ahead_of, NO_GAP)).reshape(n, -1)
-    need = gap + (other.v * other.v / (2 * driver.b[:, None, None, None])).reshape(n, -1)
-    nearest = jnp.argmin(jnp.where(gap < NO_GAP, need, 2 * NO_GAP), -1)[:, None]
-    lead_gap = jnp.take_along_axis(gap, nearest, -1)[:, 0]
-    lead = jnp.take_along_axis(other.slot.reshape(n, -1), nearest, -1)[:, 0].astype(jnp.int32)
-    return s_in, blocked, jnp.where(lead_gap < NO_GAP, lead, -1), lead_gap
+    in_front = there & splits & (other.y > jnp.maximum(me.y, 0)) & (other.y - other.length < f_out) & ~past
+    gap = jnp.where(follows, behind, jnp.where(in_front, other.y - other.length - me.y, NO_GAP))
+    need = jnp.where(gap < NO_GAP, gap + other.v * other.v / (2 * b), 2 * NO_GAP)
+    nearest = jnp.argmin(need, -1)[:, None]
+    gap, need, slot = (jnp.take_along_axis(x, nearest, -1)[:, 0] for x in (gap, need, other.slot))
+    least = jnp.full(n, 2 * NO_GAP, jnp.float32).at[vehicle].min(need)
+    chosen = (need == least[vehicle]) & (need < NO_GAP)
+    which = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(chosen, vehicle, n)].max(pair)[:n]
+    lead = jnp.where(which >= 0, slot[which].astype(jnp.int32), -1)
+    return until, lead, jnp.where(which >= 0, gap[which], NO_GAP)
 
 
 class _Way(NamedTuple):
@@ -378,21 +400,17 @@ def _where_to_stop(
     wait_s: Float[Array, "N R"],
     rows: Rows,
     sight: _Sight,
-    s_in: Float[Array, "N R C"],
-    blocked: Bool[Array, "N R C"],
+    until: Float[Array, "N R"],
     barred: Bool[Array, "N R"],
 ) -> tuple[Float[Array, "N R"], Bool[Array, "N R"]]:
     """m to where the front bumper waits, NO_GAP if it need not; and whether that is before the conflicts."""
-    x = rows.x
-    until = (
-        jnp.min(jnp.where(blocked, s_in - x[..., None], NO_GAP), -1, initial=NO_GAP) - _MARGIN
-    )  # the first stretch that is taken
-    inside = (wait_s > 0) & (wait_s - x > -_MARGIN)
-    beyond = inside & (until >= wait_s - x)  # all that is taken lies beyond the waiting point
-    until = jnp.where(beyond & (until < NO_GAP - 1), jnp.maximum(wait_s - x, 0), until)
+    taken = until < NO_GAP / 2
+    until = until - _MARGIN
+    # all that is taken may lie beyond the point to wait at within the junction
+    beyond = taken & (wait_s > 0) & (wait_s - rows.x > -_MARGIN) & (until >= wait_s - rows.x - _MARGIN)
+    until = jnp.where(beyond, jnp.maximum(wait_s - rows.x, 0), until)
     # before the line, unless the line is too near
     at_line = (rows.line > -_MARGIN) & (rows.line + _MARGIN > sight.brake)
-    taken = until < NO_GAP / 2
     line = jnp.maximum(rows.line - _MARGIN, 0)
     stop = jnp.where(taken, jnp.where(at_line & ~beyond, jnp.minimum(line, until), until), NO_GAP)
     stop = jnp.where(barred & at_line, jnp.minimum(stop, line), stop)
