@@ -40,7 +40,7 @@ def runner(name: str, traffic: Traffic, decisions: int):
             }  # fmt: skip
 
         def decision(state, _):
-            return drive(CONFIG, traffic, lane_map, state, record)
+            return drive(CONFIG, traffic, lane_map, state, record=record)
 
         state, records = jax.lax.scan(decision, state, None, length=decisions)
         return state, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)

@@ -6,19 +6,37 @@ same state. `drive` then integrates `Config.decision_every` physics steps that n
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, turn_speed
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
+from limsim_jax.traffic.collision import AfterCollision, after_collision
+from limsim_jax.traffic.collision import record as record_events
+from limsim_jax.traffic.demand import enter
+from limsim_jax.traffic.ego import (
+    Control,
+    Limits,
+    Trajectory,
+    at_slots,
+    is_free,
+    meta_acceleration,
+    meta_lane,
+    step_free,
+    sync,
+    track,
+    with_free,
+)
 from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, start
-from limsim_jax.traffic.motion import Decision, accelerations, advance
+from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes
 from limsim_jax.traffic.neighbors import (
     Ahead,
     Obstacles,
@@ -30,7 +48,7 @@ from limsim_jax.traffic.neighbors import (
 )
 from limsim_jax.traffic.right_of_way import give_way, rows_ahead
 from limsim_jax.traffic.signals import switch
-from limsim_jax.types import Config, State, Status
+from limsim_jax.types import Config, Schedule, State, Status
 
 PATIENCE = 10.0
 """s of waiting at the end of a wrong lane before a driver gives up the route."""
@@ -45,10 +63,26 @@ _WALL_ROOM = 12.0  # m before it, kept free to change lanes from a standstill
 
 @dataclass(frozen=True)
 class Traffic:
-    """Behaviour of the vehicles that nobody else controls."""
+    """Behaviour of the vehicles that nobody else controls, and what a collision leads to. All static."""
 
     model: CarFollowing = field(default_factory=ACC)
     lane_changes: bool = True
+    after_collision: AfterCollision = "stop"
+    look_for_contacts: Literal["step", "decision"] = "step"  # how often bodies are compared
+    limits: Limits = field(default_factory=Limits)  # of free egos
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Command:
+    """What egos are told to do until the next decision; who is told nothing drives like the traffic.
+
+    A free ego needs a trajectory to follow or a control to hold; an ego that keeps to lanes may take
+    meta-actions.
+    """
+
+    trajectory: Trajectory | None = None
+    control: Control | None = None
+    meta: Int[Array, " E"] | None = None  # `Meta`, or -1: decide like the traffic
 
 
 class Tick(NamedTuple):
@@ -59,8 +93,10 @@ class Tick(NamedTuple):
 
 
 @jax.named_scope("decide")
-def decide(config: Config, traffic: Traffic, lane_map: LaneMap, state: State) -> tuple[State, Decision]:
-    """Look around once: leaders, bends, lane changes. Starts lane changes in the state."""
+def decide(
+    config: Config, traffic: Traffic, lane_map: LaneMap, state: State, command: Command
+) -> tuple[State, Decision]:
+    """Look around once: leaders, right of way, lights, bends, lane changes. Starts lane changes."""
     state = _give_up(lane_map, state)
     order = sort_vehicles(lane_map, state)
     ahead = look_ahead(config, lane_map, state)
@@ -82,9 +118,16 @@ def decide(config: Config, traffic: Traffic, lane_map: LaneMap, state: State) ->
     own, second, new = (jax.tree.map(lambda x: x[:, k], found) for k in range(3))  # noqa: B023
     if traffic.lane_changes:
         choice = choose_lane(traffic.model, lane_map, state, v0, own, new, beside, beside_s, allowed, side)
-        state = start(lane_map, state, choice)
+        choice = choice._replace(side=jnp.where(is_free(state), 0, choice.side))
     else:
         choice = _stay(state)
+    if command.meta is not None:
+        asked = meta_lane(lane_map, state, command.meta)
+        choice = choice._replace(
+            side=at_slots(state.egos, asked, choice.side, ~state.egos.free & (command.meta >= 0))
+        )
+    if traffic.lane_changes or command.meta is not None:
+        state = start(lane_map, state, choice)
     rows = rows_ahead(config, lane_map, state, ahead)
     lights = switch(config, lane_map, state, rows.lane, rows.line)
     yielding = give_way(lane_map, state, rows, own, lane_states(lane_map.signals, lights.phase))
@@ -175,10 +218,30 @@ def drive(
     traffic: Traffic,
     lane_map: LaneMap,
     state: State,
-    record: object = None,
-) -> tuple[State, object]:
-    """One decision and the physics steps up to the next. `record(tick)` is stacked over the steps."""
-    state, decision = decide(config, traffic, lane_map, state)
+    schedule: Schedule | None = None,
+    command: Command | None = None,
+    record: Callable[[Tick], Any] | None = None,
+) -> tuple[State, Any]:
+    """One decision and the physics steps up to the next.
+
+    Args:
+      config: of the run.
+      traffic: behaviour.
+      lane_map: where.
+      state: the world now.
+      schedule: who may enter; nobody if None.
+      command: of the egos.
+      record: its results are stacked over the steps, `[decision_every, ...]`.
+
+    Raises:
+      ValueError: an unknown `after_collision` or `look_for_contacts`.
+    """
+    if traffic.look_for_contacts not in ("step", "decision"):
+        raise ValueError(f"look for contacts every '{traffic.look_for_contacts}'? known are step, decision")
+    command = Command() if command is None else command
+    if schedule is not None:
+        state = enter(config, lane_map, schedule, state)
+    state, decision = decide(config, traffic, lane_map, state, command)
 
     # what no step changes stays out of the loop
     fixed = {name: getattr(state, name) for name in ("driver", "shape", "vehicle", "lights", "queues")}
@@ -186,20 +249,64 @@ def drive(
     def bare(state: State) -> State:
         return replace(state, **dict.fromkeys(fixed))
 
-    def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], object]:
+    def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], Any]:
         state, x = carry
         state = replace(state, **fixed)
-        a = accelerations(traffic.model, state, decision, x)
-        state, dx, left = advance(config, lane_map, state, a)
-        state = replace(state, step=state.step + 1)
-        out = None if record is None else record(Tick(state, left))  # pyright: ignore[reportCallIssue]
+        state, dx, left = _step(config, traffic, lane_map, state, decision, x, command)
+        out = None if record is None else record(Tick(state, left))
         return (bare(state), x + dx), out
 
     before, x = state.lane, jnp.zeros_like(state.s)
     (state, _), records = lax.scan(step, (bare(state), x), None, length=config.decision_every)
     state = replace(state, **fixed)
-    shows = lane_states(lane_map.signals, state.lights.phase)
+    if traffic.look_for_contacts == "decision":
+        state = record_events(config, lane_map, state)
+    if state.egos.slot.shape[0]:
+        state = sync(lane_map, state, boxes(lane_map, state))
+    return _ran_red(lane_map, state, before), records
+
+
+def _step(
+    config: Config,
+    traffic: Traffic,
+    lane_map: LaneMap,
+    state: State,
+    decision: Decision,
+    x: Float[Array, " N"],
+    command: Command,
+) -> tuple[State, Float[Array, " N"], Bool[Array, " N"]]:
+    """One physics step, `x` m after the decision: the state, the metres travelled, who has left."""
+    egos = state.egos
+    a = accelerations(traffic.model, state, decision, x)
+    if command.meta is not None:
+        told = meta_acceleration(jnp.maximum(command.meta, 0), state, a)
+        a = at_slots(egos, told, a, ~egos.free & (command.meta >= 0))
+    a = after_collision(state, a, traffic.after_collision)
+    free = None
+    if command.trajectory is not None or command.control is not None:
+        control = command.control
+        if command.trajectory is not None:
+            time = state.step.astype(jnp.float32) * config.dt
+            control = track(config, traffic.limits, state, command.trajectory, time)
+        assert control is not None
+        wish = after_collision(state, control.acceleration, traffic.after_collision, egos.slot)
+        control = replace(control, acceleration=wish)
+        free = step_free(config, lane_map, traffic.limits, state, control)
+        a = jnp.where(is_free(state), free.a, a)
+    moved, dx, left = advance(config, lane_map, state, a)
+    if free is not None:
+        dx = jnp.where(is_free(state), free.distance - state.distance, dx)
+        left &= ~is_free(state)
+        moved = with_free(moved, free)
+    state = replace(moved, step=state.step + 1)
+    if traffic.look_for_contacts == "step":
+        state = record_events(config, lane_map, state)
+    return state, dx, left
+
+
+def _ran_red(lane_map: LaneMap, state: State, before: Int[Array, " N"]) -> State:
+    """Record who has crossed a stop line on red since the decision, when it was on lane `before`."""
+    red = lane_states(lane_map.signals, state.lights.phase) == SignalState.RED
     entered = (state.lane != before) & state.active
-    red = shows == SignalState.RED
     ran = entered & (red[state.lane] | (red[state.previous] & (state.previous != before)))
-    return replace(state, status=state.status | jnp.where(ran, int(Status.RED_LIGHT), 0)), records
+    return replace(state, status=state.status | jnp.where(ran, int(Status.RED_LIGHT), 0))

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, width
 from limsim_jax.numerics import safe_divide
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing, ballistic, per_obstacle
+from limsim_jax.traffic.ego import overlay_boxes
 from limsim_jax.traffic.neighbors import Obstacles
 from limsim_jax.types import Config, State, Status
 
@@ -192,7 +193,7 @@ def boxes(lane_map: LaneMap, state: State) -> Float[Array, "N 5"]:
     """Oriented boxes: x, y (m) of the centre, heading (rad), length, width (m).
 
     The body lies on the lane at its centre, half a length behind the front bumper, which may be on the
-    lane before; it is turned by the direction of its motion.
+    lane before; it is turned by the direction of its motion. Free egos are where they are in the plane.
     """
     shape = state.shape
     s = state.s - shape.length / 2
@@ -201,4 +202,4 @@ def boxes(lane_map: LaneMap, state: State) -> Float[Array, "N 5"]:
     s = jnp.where(behind, s + lane_map.length[state.previous], s)
     x, y, heading = pose(lane_map, lane, s, state.d)
     turned = jnp.arctan2(lateral_speed(state), jnp.maximum(state.v, 0.5))
-    return jnp.stack([x, y, heading + turned, shape.length, shape.width], -1)
+    return overlay_boxes(state, jnp.stack([x, y, heading + turned, shape.length, shape.width], -1))

@@ -1,0 +1,461 @@
+"""SUMO's vehicles, trips and flows as a schedule: who departs when, where, how fast and by which way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, LaneMap, bucket, lane_rows
+from limsim_jax.maps.network import Lane, MapError, Network
+from limsim_jax.maps.routing import RouteTable, build_fixed_routes, build_routes
+from limsim_jax.maps.sumo_demand import Demand, Flow, Vehicle, VehicleType
+from limsim_jax.traffic.demand import NEVER, departure_place, entry_speed, start_state, typical_vehicles
+from limsim_jax.traffic.vehicles import from_vtypes, sample_vehicles
+from limsim_jax.types import Queues, Scenario, Schedule
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SumoScenario:
+    """What comes of a SUMO demand: an empty road, and a schedule of those who enter."""
+
+    lane_map: LaneMap
+    """With the ways of these vehicles as its `routes`."""
+    scenario: Scenario
+    vehicles: tuple[str, ...]
+    """Ids of the vehicles in the rows of the schedule; those of a flow have its id and a number."""
+    routes: tuple[tuple[str, ...], ...]
+    """Edges of every goal; only the last one where the way there is free."""
+    notes: tuple[str, ...]
+    """One line per thing that is left out or done in another way than SUMO does, with counts."""
+
+
+def sumo_scenario(
+    network: Network,
+    lane_map: LaneMap,
+    demand: Demand,
+    *,
+    slots: int,
+    begin: float | None = None,
+    end: float | None = None,
+    seed: int = 0,
+) -> SumoScenario:
+    """Turn SUMO's demand into a scenario.
+
+    Vehicles follow the edges of their routes on lanes that their class may use; trips find their way by
+    `maps.routing`. What SUMO leaves to chance (flows, distributions, drivers) is drawn here from `seed`.
+    There is one queue per departure lane.
+
+    Args:
+      network: the map.
+      lane_map: of that map; its routes are replaced.
+      demand: from `maps.sumo_demand.read_demand`.
+      slots: vehicle slots of the world.
+      begin: time of the files at which the scenario starts, s; default: that of the first departure.
+      end: s; nobody departs from then on.
+      seed: of all draws.
+
+    Raises:
+      MapError: a vehicle type that no file defines, or a flow without an end.
+      ValueError: nobody departs.
+    """
+    notes = _Notes()
+    departures = _departures(demand, end, np.random.default_rng([seed, 0]), notes)
+    first = min((d.time for d in departures), default=0.0)
+    begin = math.floor(first) if begin is None else begin
+    early = [d for d in departures if d.time < begin]
+    notes.add("departs before the scenario begins; left out", [d.id for d in early])
+    departures = [d for d in departures if d.time >= begin]
+    departures = _with_types(demand, departures, np.random.default_rng([seed, 1]), notes)
+    ways = _Ways(network, lane_map)
+    placed = _place(network, ways, demand, departures, np.random.default_rng([seed, 2]), notes)
+    if not placed:
+        raise ValueError("the demand has no vehicle that departs: " + "; ".join(notes.lines()))
+    placed.sort(key=lambda d: (d.row, d.time))
+    lane_map = replace(lane_map, routes=ways.table())
+    types = list(dict.fromkeys(d.type for d in placed))
+    scenario = _scenario(lane_map, demand, types, placed, begin, slots, seed)
+    return SumoScenario(
+        lane_map=lane_map,
+        scenario=scenario,
+        vehicles=tuple(d.id for d in placed),
+        routes=tuple(ways.routes),
+        notes=tuple(notes.lines()),
+    )
+
+
+@dataclass
+class _Notes:
+    """Messages, and the ids that they concern."""
+
+    found: dict[str, list[str]] = field(default_factory=dict)
+
+    def add(self, message: str, ids: Sequence[str]) -> None:
+        if ids:
+            self.found.setdefault(message, []).extend(ids)
+
+    def lines(self) -> list[str]:
+        return [f"{len(ids)} x {message} ('{ids[0]}' first)" for message, ids in self.found.items()]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Departure:
+    """One vehicle."""
+
+    id: str
+    number: int  # in the order of the files
+    time: float  # s
+    vehicle: Vehicle
+    type: str = ""
+    row: int = NO_LANE
+    s: float | None = None  # m; None: where the lane starts
+    v: float = math.inf  # m/s, wanted
+    goal: int = -1
+
+
+def _departures(
+    demand: Demand, end: float | None, rng: np.random.Generator, notes: _Notes
+) -> list[_Departure]:
+    """Everybody who departs before `end`, in the order of the files."""
+    found: list[tuple[str, float, Vehicle]] = []
+    for vehicle in demand.vehicles.values():
+        if isinstance(vehicle.depart, str):
+            notes.add(f"departs '{vehicle.depart}', not at a time; left out", [vehicle.id])
+        else:
+            found.append((vehicle.id, vehicle.depart, vehicle))
+    for flow in demand.flows.values():
+        times = _flow_times(flow, end, rng)
+        found += [(f"{flow.vehicle.id}.{i}", float(time), flow.vehicle) for i, time in enumerate(times)]
+    late = [name for name, time, _ in found if end is not None and time >= end]
+    notes.add("departs after the scenario ends; left out", late)
+    return [
+        _Departure(id=name, number=number, time=time, vehicle=vehicle)
+        for number, (name, time, vehicle) in enumerate(found)
+        if end is None or time < end
+    ]
+
+
+def _flow_times(flow: Flow, end: float | None, rng: np.random.Generator) -> list[float]:
+    """Departure times of a flow, s."""
+    last = min((t for t in (flow.end, end) if t is not None), default=math.inf)
+    most = math.inf if flow.number is None else flow.number
+    rates = (flow.probability, flow.poisson_rate, flow.vehicles_per_hour)
+    if 0 in rates or most == 0:
+        return []
+    time, period = flow.begin, flow.period
+    if flow.vehicles_per_hour is not None:
+        period = 3600 / flow.vehicles_per_hour
+    elif rates == (None, None, None) and period is None and last < math.inf:
+        period = ((flow.end or last) - flow.begin) / most  # by number alone
+    if math.isinf(min(most, last)) or (period == 0 and math.isinf(most)) or rates == (None,) * 3 and period is None:
+        raise MapError(
+            "it emits vehicles without end; give it an end, or the scenario",
+            file=flow.vehicle.file or None,
+            line=flow.vehicle.line,
+            element=f"flow {flow.vehicle.id}",
+        )
+    if flow.probability is not None:
+        time -= 1  # a chance in the first second, too
+    elif flow.poisson_rate is None:
+        time -= period or 0.0
+    times: list[float] = []
+    while True:
+        if flow.probability is not None:
+            time += rng.geometric(flow.probability)
+        elif flow.poisson_rate is not None:
+            time += rng.exponential(1 / flow.poisson_rate)
+        else:
+            time += period or 0.0
+        if time >= last or len(times) >= most:
+            return times
+        times.append(time)
+
+
+def _with_types(
+    demand: Demand, departures: list[_Departure], rng: np.random.Generator, notes: _Notes
+) -> list[_Departure]:
+    """The departures of motor vehicles, with their types; distributions are drawn."""
+    kept = []
+    for departure in departures:
+        name = departure.vehicle.type
+        while name in demand.type_distributions:
+            choices = demand.type_distributions[name]
+            weights = np.array(choices.weights)
+            name = choices.members[rng.choice(len(weights), p=weights / weights.sum())]
+        if name not in demand.types:
+            raise MapError(
+                f"no file defines vehicle type '{name}'; read the one that does, too",
+                file=departure.vehicle.file or None,
+                line=departure.vehicle.line,
+                element=f"vehicle {departure.id}",
+            )
+        kind = demand.types[name]
+        if kind.engine_class is None:
+            notes.add(f"vClass '{kind.vehicle_class}' is no motor traffic on roads; left out", [departure.id])
+        else:
+            kept.append(replace(departure, type=name))
+    return kept
+
+
+class _Ways:
+    """Columns of a route table, found as they are asked for."""
+
+    def __init__(self, network: Network, lane_map: LaneMap) -> None:
+        self.network = network
+        self.rows = lane_rows(network)
+        self.size = lane_map.length.shape[0]
+        self.lanes = list(network.drivable_lanes())
+        self.routes: list[tuple[str, ...]] = []
+        self.columns: list[RouteTable] = []
+        self.known: dict[tuple[str | None, tuple[str, ...]], int] = {}
+        # classes that may use the same lanes share columns
+        groups: dict[tuple[bool, ...], str] = {}
+        self.like = {
+            name: groups.setdefault(tuple(name in lane.access for lane in self.lanes), name)
+            for name in VEHICLE_CLASSES
+        }
+
+    def along(self, edges: tuple[str, ...], vehicle_class: str | None) -> int:
+        """Column of a route. Raises `MapError` if it cannot be driven."""
+        key = (self.like.get(vehicle_class or ""), edges)
+        if key not in self.known:
+            table = build_fixed_routes(self.network, self.rows, [edges], vehicle_class=vehicle_class)
+            self._add(table, edges, key[0])
+        return self.known[key]
+
+    def towards(self, edge: str, vehicle_class: str | None) -> int:
+        """Column of a destination. Raises `MapError` if no lane of it is for motor traffic."""
+        key = (self.like.get(vehicle_class or ""), (edge,))
+        if key not in self.known:
+            ends = [lane.id for lane in self.network.road_lanes(edge) if lane.drivable]
+            table = build_routes(self.network, self.rows, [ends], vehicle_class=vehicle_class)
+            self._add(table, (edge,), key[0])
+        return self.known[key]
+
+    def _add(self, table: RouteTable, edges: tuple[str, ...], group: str | None) -> None:
+        """A column serves all that remains of its route on the way, but not a destination by itself."""
+        column = len(self.columns)
+        self.columns.append(table)
+        self.routes.append(edges)
+        self.known[group, edges] = column
+        for i in range(1, len(edges) - 1):
+            self.known.setdefault((group, edges[i:]), column)
+
+    def table(self) -> RouteTable:
+        """All columns, padded to the size of the lane map."""
+        whole = RouteTable(
+            **{name: np.hstack([vars(c)[name] for c in self.columns]) for name in vars(self.columns[0])}
+        )
+        padded = whole.pad(lanes=self.size, goals=bucket(len(self.columns), 16))
+        return jax.tree.map(jnp.asarray, padded)
+
+
+def _place(
+    network: Network,
+    ways: _Ways,
+    demand: Demand,
+    departures: list[_Departure],
+    rng: np.random.Generator,
+    notes: _Notes,
+) -> list[_Departure]:
+    """The departures with lane, place, speed and goal; long routes first, so that others share theirs."""
+    routed = [(d, _edges(demand, d.vehicle, rng)) for d in departures]
+    placed = []
+    usage: dict[int, int] = {}
+    for departure, edges in sorted(routed, key=lambda pair: -len(pair[1])):
+        _note_what_is_not_used(departure, demand, notes)
+        kind = demand.types[departure.type]
+        if not edges:
+            notes.add("has neither a route nor an origin and a destination edge; left out", [departure.id])
+            continue
+        lane, goal = _way(network, ways, departure, edges, kind, usage, rng, notes)
+        if lane is None:
+            continue
+        row = ways.rows[lane.id]
+        usage[row] = usage.get(row, 0) + 1
+        s, v = _depart_pos(departure, lane, rng, notes), _depart_speed(departure, lane, rng)
+        placed.append(replace(departure, row=row, s=s, v=v, goal=goal))
+    return placed
+
+
+def _edges(demand: Demand, vehicle: Vehicle, rng: np.random.Generator) -> tuple[str, ...]:
+    """Edges of the route; of a trip origin and destination; empty if there are none."""
+    name = vehicle.route
+    while name in demand.route_distributions:
+        choices = demand.route_distributions[name]
+        weights = np.array(choices.weights)
+        name = choices.members[rng.choice(len(weights), p=weights / weights.sum())]
+    if name is not None:
+        route = demand.routes[name]
+        return route.edges * (route.repeat + 1)
+    if vehicle.origin is None or vehicle.destination is None:
+        return ()
+    return (vehicle.origin, vehicle.destination)
+
+
+def _note_what_is_not_used(departure: _Departure, demand: Demand, notes: _Notes) -> None:
+    vehicle = departure.vehicle
+    route = demand.routes.get(vehicle.route or "")
+    used = {
+        "stops are not made": vehicle.stops or (route is not None and route.stops),
+        "via edges are not visited": vehicle.via,
+        "departPosLat is not used: vehicles enter in the middle of the lane": vehicle.depart_pos_lat
+        not in ("center", 0.0),
+        "arrivalLane, arrivalPos and arrivalSpeed are not used: vehicles leave at the end of the last edge": (
+            vehicle.arrival_lane != "current"
+            or vehicle.arrival_pos != "max"
+            or vehicle.arrival_speed != "current"
+        ),
+    }
+    used |= {f"attribute {name} is not used": True for name in vehicle.parameters}
+    for message, says in used.items():
+        if says:
+            notes.add(message, [departure.id])
+
+
+def _way(
+    network: Network,
+    ways: _Ways,
+    departure: _Departure,
+    edges: tuple[str, ...],
+    kind: VehicleType,
+    usage: dict[int, int],
+    rng: np.random.Generator,
+    notes: _Notes,
+) -> tuple[Lane | None, int]:
+    """Departure lane and column; no lane if there is no way."""
+    free = None if kind.vehicle_class == "ignoring" else kind.engine_class
+    is_trip = departure.vehicle.route is None
+    choices = []
+    if not is_trip and len(set(edges)) == len(edges):
+        choices.append((ways.along, edges, free, ""))
+        choices.append((ways.along, edges, None, "goes along lanes that are not open to its class"))
+    twice = "its route visits an edge twice; it takes the shortest way to the last edge"
+    other = "its route cannot be driven; it takes the shortest way to the last edge"
+    why = "" if is_trip else twice if len(set(edges)) < len(edges) else other
+    choices.append((ways.towards, edges[-1], free, why))
+    for find, target, vehicle_class, note in choices:
+        try:
+            goal = find(target, vehicle_class)
+        except MapError:
+            continue
+        lane = _depart_lane(network, ways, departure, edges[0], goal, vehicle_class, usage, rng, notes)
+        if lane is not None:
+            notes.add(note, [departure.id] if note else [])
+            return lane, goal
+    notes.add("there is no way from its first edge to its last one; left out", [departure.id])
+    return None, -1
+
+
+def _depart_lane(
+    network: Network,
+    ways: _Ways,
+    departure: _Departure,
+    edge: str,
+    goal: int,
+    vehicle_class: str | None,
+    usage: dict[int, int],
+    rng: np.random.Generator,
+    notes: _Notes,
+) -> Lane | None:
+    """The lane that departLane asks for, or the nearest one from which there is a way."""
+    table = ways.columns[goal]
+    lanes = [
+        lane
+        for lane in network.road_lanes(edge)
+        if lane.drivable and (vehicle_class is None or vehicle_class in lane.access)
+    ]
+    usable = [lane for lane in lanes if table.reachable[ways.rows[lane.id], 0]]
+    if not usable:
+        return None
+    wish = departure.vehicle.depart_lane
+    if wish == "random":
+        return usable[rng.integers(len(usable))]
+    if wish in ("best", "free", "allowed"):
+        change = np.array([table.change_distance[ways.rows[lane.id], 0] for lane in usable])
+        crowd = [usage.get(ways.rows[lane.id], 0) for lane in usable]
+        good = [i for i in range(len(usable)) if wish == "allowed" or change[i] >= change.max() - 1.0]
+        return usable[min(good, key=lambda i: (crowd[i], usable[i].number))]
+    number = min(lane.number for lane in lanes) if wish == "first" else wish
+    if not isinstance(number, int):
+        notes.add(f"departLane '{wish}' is unknown; taken as 'first'", [departure.id])
+        number = min(lane.number for lane in lanes)
+    nearest = min(usable, key=lambda lane: (abs(lane.number - number), lane.number))
+    if nearest.number != number:
+        notes.add("there is no way from its departLane; it departs on the nearest lane", [departure.id])
+    return nearest
+
+
+def _depart_pos(departure: _Departure, lane: Lane, rng: np.random.Generator, notes: _Notes) -> float | None:
+    """Front bumper, m; None: as far back as the body fits."""
+    wish = departure.vehicle.depart_pos
+    if wish == "random":
+        return rng.uniform(0, lane.length)
+    if isinstance(wish, str):
+        if wish != "base":
+            notes.add(f"departPos '{wish}' is taken as 'base'", [departure.id])
+        return None
+    return min(max(wish + lane.length if wish < 0 else wish, 0.0), lane.length)
+
+
+def _depart_speed(departure: _Departure, lane: Lane, rng: np.random.Generator) -> float:
+    """m/s; infinite for as fast as is safe."""
+    wish = departure.vehicle.depart_speed
+    if wish == "random":
+        return rng.uniform(0, lane.speed_limit)
+    return math.inf if isinstance(wish, str) else wish
+
+
+def _scenario(
+    lane_map: LaneMap,
+    demand: Demand,
+    types: list[str],
+    placed: list[_Departure],
+    begin: float,
+    slots: int,
+    seed: int,
+) -> Scenario:
+    """Departures in order of lane and time as a scenario with empty roads."""
+    lanes = sorted({d.row for d in placed})
+    rows, origins = bucket(len(placed), 64), bucket(len(lanes), 4)
+
+    def table(values: list[float], fill: float, dtype: type) -> NDArray[np.generic]:
+        return np.array(values + [fill] * (rows - len(values)), dtype)
+
+    start = np.searchsorted([d.row for d in placed], lanes).tolist()
+    start += [len(placed)] * (origins + 1 - len(lanes))
+    population = from_vtypes([demand.types[name] for name in types])
+    number = jnp.asarray(table([d.number for d in placed], 0, np.int32))
+    of_type = jnp.asarray(table([types.index(d.type) for d in placed], 0, np.int32))
+    lane = jnp.asarray(table([d.row for d in placed], NO_LANE, np.int32))
+    goal = jnp.asarray(table([d.goal for d in placed], 0, np.int32))
+    factor = table([d.vehicle.speed_factor or math.nan for d in placed], math.nan, np.float32)
+    at = jnp.asarray(table([-1.0 if d.s is None else d.s for d in placed], -1.0, np.float32))
+    wanted = jnp.asarray(table([min(d.v, NEVER) for d in placed], 0.0, np.float32))
+
+    driver, shape = jax.jit(sample_vehicles)(population, jax.random.key(seed), number, of_type)
+    own = jnp.where(jnp.isnan(factor), driver.speed_factor, factor)
+    driver = replace(driver, speed_factor=own)
+    base = departure_place(lane_map, lane, shape.length)
+    s = jnp.clip(at, base, jnp.maximum(base, lane_map.length[lane] - 0.5))
+    schedule = Schedule(
+        time=jnp.asarray(table([d.time - begin for d in placed], NEVER, np.float32)),
+        lane=lane,
+        s=s,
+        v=jnp.minimum(wanted, entry_speed(lane_map, driver, lane, s, goal)),
+        goal=goal,
+        driver=driver,
+        shape=shape,
+        start=jnp.asarray(start, jnp.int32),
+    )
+    zero = jnp.zeros(slots, jnp.float32)
+    nowhere, nothing = jnp.full(slots, NO_LANE), jnp.zeros(slots, jnp.int32)
+    vehicles = typical_vehicles(population, slots)
+    state = start_state(lane_map, *vehicles, lane=nowhere, s=zero, v=zero, goal=nothing)
+    queues = Queues(next=schedule.start[:-1], full=jnp.int32(0))
+    return Scenario(start=replace(state, queues=queues), schedule=schedule)
