@@ -1,0 +1,136 @@
+"""Many random episodes of background traffic on many maps, and what went wrong in them.
+
+    python experiments/soundness.py [--episodes 1000] [--map NAME_OR_FILE ...] [--out soundness]
+
+Every episode has other vehicles at the start, other arrivals, drivers and goals. Writes
+experiments/results/soundness.json and .md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from limsim_jax.maps import build_lane_map, bundled_maps, load_map
+from limsim_jax.maps.routing import default_goals
+from limsim_jax.rollout import Rollout, Worlds, use_all_cores
+from limsim_jax.traffic.demand import Flow, build_demand, entries, sample_scenario
+from limsim_jax.traffic.engine import Traffic
+from limsim_jax.traffic.vehicles import default_population
+from limsim_jax.types import Config
+
+RESULTS = Path(__file__).parent / "results"
+
+RATES = {"highway": 4500.0, "ramp": 1500.0, "intersection": 400.0, "roundabout": 400.0, "long_route": 250.0}
+"""veh/h per origin; other maps: `OTHER_RATE`."""
+
+OTHER_RATE = 200.0
+INITIAL = 20  # vehicles at the start, about
+HORIZON = 120.0  # s
+
+
+def episodes(
+    path: str | Path, rate: float, count: int, *, slots: int, chunk: int, initial: int = INITIAL
+) -> dict[str, Any]:
+    """Run `count` episodes on a map and add up what happened."""
+    network = load_map(path)
+    lane_map = build_lane_map(network)
+    goals = default_goals(network)
+    flows = [Flow(origin=name, rate=rate) for name in entries(network)]
+    km = sum(lane.length for lane in network.drivable_lanes() if lane.junction is None) / 1000
+    demand = build_demand(
+        network, lane_map, goals, flows, default_population(), horizon=HORIZON, density=initial / km
+    )
+    run = Rollout(Config(dt=0.1), Traffic(), HORIZON)
+    start = time.perf_counter()
+    worlds = Worlds(run, lane_map, lambda key: sample_scenario(demand, lane_map, key, slots), chunk=chunk)
+    worlds.compile()
+    compiled = time.perf_counter()
+    totals = worlds.run_totals(range(count))
+    done = time.perf_counter()
+    events = {
+        name: int(np.sum(getattr(totals, name)))
+        for name in (
+            "entered", "left", "waiting", "full", "collided", "off_road", "wrong_way", "ran_red", "missed",
+            "hard", "broken", "gridlock",
+        )
+    }  # fmt: skip
+    bad = np.nonzero(totals.collided | totals.gridlock | totals.off_road | totals.broken)[0]
+    return events | {
+        "map": Path(path).stem,
+        "episodes": count,
+        "slots": slots,
+        "rate": rate,
+        "collided_episodes": int(np.sum(totals.collided > 0)),
+        "off_road_episodes": int(np.sum(totals.off_road > 0)),
+        "deceleration": round(float(np.max(totals.deceleration)), 2),
+        "longest_wait": round(float(np.max(totals.longest_wait)), 1),
+        "vehicle_km": round(float(np.sum(totals.distance)) / 1000, 1),
+        "mean_speed": round(float(np.sum(totals.distance) / np.sum(totals.time)), 2),
+        "compile_s": round(compiled - start, 1),
+        "run_s": round(done - compiled, 1),
+        "suspects": bad[:10].tolist(),
+    }
+
+
+COLUMNS = {
+    "map": "map",
+    "episodes": "episodes",
+    "entered": "vehicles",
+    "vehicle_km": "vehicle-km",
+    "collided_episodes": "episodes with a collision",
+    "gridlock": "gridlock",
+    "broken": "not finite",
+    "off_road": "off road",
+    "wrong_way": "wrong way",
+    "ran_red": "red light",
+    "missed": "missed lane changes",
+    "deceleration": "hardest braking, m/s^2",
+    "full": "no slot",
+    "mean_speed": "mean speed, m/s",
+}
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown."""
+    lines = ["| " + " | ".join(COLUMNS.values()) + " |", "|---" * len(COLUMNS) + "|"]
+    lines += ["| " + " | ".join(str(row[name]) for name in COLUMNS) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Parse the command line, run, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument("--map", nargs="*", default=list(bundled_maps()))
+    parser.add_argument("--slots", type=int, default=64)
+    parser.add_argument("--chunk", type=int, default=64)
+    parser.add_argument("--initial", type=int, default=INITIAL)
+    parser.add_argument("--rate", type=float)
+    parser.add_argument("--out", default="soundness")
+    options = parser.parse_args()
+    use_all_cores()
+    rows = []
+    for name in options.map:
+        rate = options.rate or RATES.get(name, OTHER_RATE)
+        path = bundled_maps().get(name) or name
+        row = episodes(
+            path, rate, options.episodes, slots=options.slots, chunk=options.chunk, initial=options.initial
+        )
+        rows.append(row)
+        print(json.dumps(row), flush=True)
+        jax.clear_caches()
+    RESULTS.mkdir(exist_ok=True)
+    head = "Regenerate: `python experiments/soundness.py`\n\n"
+    (RESULTS / f"{options.out}.json").write_text(json.dumps(rows, indent=1) + "\n")
+    (RESULTS / f"{options.out}.md").write_text(head + table(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+"""What a policy is: it looks at the world once per decision and commands the egos."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import jax
+from jaxtyping import Array, Key
+
+from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.traffic.engine import Command
+from limsim_jax.types import Config, State
+
+
+class Policy(Protocol):
+    """A pure function of the world with a memory of its own; written for one world."""
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """The memory at the start: any pytree, of the same shapes ever after."""
+        ...
+
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: Key[Array, ""]
+    ) -> tuple[Command, Any]:
+        """What the egos do until the next decision, and the new memory. `key` is of this decision."""
+        ...
+
+
+class Traffic:
+    """The egos drive as all traffic does: car following, lane changes, right of way."""
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """Nothing to remember."""
+        del config, lane_map, state
+
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
+    ) -> tuple[Command, Any]:
+        """No command."""
+        del config, lane_map, state, key
+        return Command(), memory

@@ -1,0 +1,363 @@
+"""Worlds through time: one, a batch, all devices; branched, saved, resumed.
+
+    run = Rollout(config, traffic, horizon=60.0)
+    result = jax.jit(run)(lane_map, scenario, key)                     # one world
+    totals = Worlds(run, lane_map, sampler).run_totals(range(1000))    # many, on all local devices
+
+A world depends on its seed alone, not on those beside it. The same package version, backend and chunk shape
+give the same bits. A run that is saved and resumed ends as one that was not.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from limsim_jax.maps.cache import directory
+from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.policies.base import Policy
+from limsim_jax.policies.base import Traffic as LikeTraffic
+from limsim_jax.traffic.collision import collided
+from limsim_jax.traffic.engine import Tick, Traffic, drive
+from limsim_jax.traffic.motion import boxes
+from limsim_jax.types import Config, Scenario, Schedule, State, Status
+
+GRIDLOCK = 90.0
+"""s of standing after which a vehicle counts as stuck, and its world as gridlocked."""
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Totals:
+    """What happened in a world, kept up while it runs. Vehicles count once per kind of event."""
+
+    entered: Int[Array, ""]  # those of the start included
+    left: Int[Array, ""]  # at their goals
+    waiting: Int[Array, ""]  # outside, for room to enter
+    full: Int[Array, ""]  # decisions at which somebody could not enter for want of a slot
+    collided: Int[Array, ""]
+    off_road: Int[Array, ""]
+    wrong_way: Int[Array, ""]
+    ran_red: Int[Array, ""]
+    missed: Int[Array, ""]  # took another goal for want of a gap to change lanes
+    hard: Int[Array, ""]  # braked harder than `b_max`
+    broken: Int[Array, ""]  # numbers that are not finite
+    gridlock: Bool[Array, ""]
+    deceleration: Float[Array, ""]  # m/s^2, the hardest
+    longest_wait: Float[Array, ""]  # s
+    distance: Float[Array, ""]  # m, of all vehicles
+    time: Float[Array, ""]  # s, of all vehicles on the road
+    travel_time: Float[Array, ""]  # s, of those who have left, together
+
+
+class Result(NamedTuple):
+    """The end of a run."""
+
+    state: State
+    totals: Totals
+    trace: Any  # what `record` returned, [steps, ...]
+
+
+class Trace(NamedTuple):
+    """The standard record of a step, for `N` slots."""
+
+    time: Float[Array, ""]  # s
+    active: Bool[Array, " N"]
+    vehicle: Int[Array, " N"]  # row of the schedule; -1: was there at the start
+    lane: Int[Array, " N"]
+    s: Float[Array, " N"]
+    d: Float[Array, " N"]
+    v: Float[Array, " N"]
+    a: Float[Array, " N"]
+    box: Float[Array, "N 5"]  # x, y (m), heading (rad), length, width (m)
+    status: Int[Array, " N"]
+    phase: Int[Array, " P"]  # of the signal programs
+
+
+def trace(lane_map: LaneMap) -> Callable[[Tick], Trace]:
+    """A `record` that keeps everything that a picture or a table needs."""
+
+    def record(tick: Tick) -> Trace:
+        state = tick.state
+        return Trace(
+            time=tick.time,
+            active=state.active,
+            vehicle=state.vehicle,
+            lane=state.lane,
+            s=state.s,
+            d=state.d,
+            v=state.v,
+            a=state.a,
+            box=boxes(lane_map, state),
+            status=state.status,
+            phase=state.lights.phase,
+        )
+
+    return record
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A run of one world from a scenario: a pure function, for `jit` and `vmap`.
+
+    Attributes:
+      config: steps and look-ahead.
+      traffic: behaviour of the others.
+      horizon: s; rounded up to whole decisions.
+      policy: drives the egos.
+      record: of every physics step, given the lane map: `trace`, or None for none.
+    """
+
+    config: Config
+    traffic: Traffic
+    horizon: float
+    policy: Policy = field(default_factory=LikeTraffic)
+    record: Callable[[LaneMap], Callable[[Tick], Any]] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.horizon > 0 or not math.isfinite(self.horizon):
+            raise ValueError(f"a horizon of {self.horizon} s? it must be above 0")
+
+    @property
+    def decisions(self) -> int:
+        """Decisions within the horizon."""
+        return math.ceil(self.horizon / self.config.decision_time - 1e-6)
+
+    def __call__(self, lane_map: LaneMap, scenario: Scenario, key: Key[Array, ""]) -> Result:
+        """Run from the start. `key` is the policy's."""
+        memory = self.policy.init(self.config, lane_map, scenario.start)
+        carry = scenario.start, memory, begin(scenario.start)
+        return self.go_on(lane_map, scenario.schedule, key, carry)[0]
+
+    def go_on(
+        self,
+        lane_map: LaneMap,
+        schedule: Schedule,
+        key: Key[Array, ""],
+        carry: tuple[State, Any, Totals],
+        decisions: int | None = None,
+    ) -> tuple[Result, tuple[State, Any, Totals]]:
+        """Run on from state, memory of the policy, and totals; gives those back, too."""
+        record = None if self.record is None else self.record(lane_map)
+
+        def decide(carry: tuple[State, Any, Totals], _: None) -> tuple[tuple[State, Any, Totals], Any]:
+            state, memory, totals = carry
+            now = jax.random.fold_in(key, state.step)
+            command, new_memory = self.policy(self.config, lane_map, state, memory, now)
+            after, records = drive(self.config, self.traffic, lane_map, state, schedule, command, record)
+            new_totals = count(self.config, lane_map, schedule, totals, state, after)
+            new = after, new_memory, new_totals
+            if self.traffic.after_collision == "end":
+                over = collided(state)
+                new = jax.tree.map(lambda x, y: jnp.where(over, x, y), carry, new)
+            return new, records
+
+        length = self.decisions if decisions is None else decisions
+        carry, records = lax.scan(decide, carry, None, length=length)
+        records = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
+        return Result(carry[0], carry[2], records), carry
+
+
+def begin(state: State) -> Totals:
+    """Totals at the start."""
+    zero, nothing = jnp.int32(0), jnp.float32(0)
+    return Totals(
+        entered=jnp.sum(state.active, dtype=jnp.int32),
+        left=zero, waiting=zero, full=zero, collided=zero, off_road=zero, wrong_way=zero, ran_red=zero,
+        missed=zero, hard=zero, broken=zero, gridlock=jnp.bool_(False), deceleration=nothing,
+        longest_wait=nothing, distance=nothing, time=nothing, travel_time=nothing,
+    )  # fmt: skip
+
+
+@jax.named_scope("count")
+def count(
+    config: Config, lane_map: LaneMap, schedule: Schedule, totals: Totals, before: State, after: State
+) -> Totals:
+    """Totals after one decision more."""
+    del lane_map
+    now = after.step.astype(jnp.float32) * config.dt
+    same = (before.vehicle == after.vehicle) & (before.entered == after.entered) & before.active
+    entered = jnp.sum(after.queues.next - before.queues.next, dtype=jnp.int32)
+    fresh = ~same & ((after.entered > before.entered) | (after.vehicle != before.vehicle))
+    was = before.active | fresh  # on the road at some time of this decision
+    left = was & ~after.active
+    new = jnp.where(was, after.status & ~jnp.where(same, before.status, 0), 0)
+    driven = after.distance - jnp.where(fresh, 0, before.distance)
+
+    def events(bit: Status) -> Int[Array, ""]:
+        return jnp.sum((new & int(bit)) != 0, dtype=jnp.int32)
+
+    due = jnp.sum((schedule.time <= now) & jnp.isfinite(schedule.time), dtype=jnp.int32)
+    return Totals(
+        entered=totals.entered + entered,
+        left=totals.left + jnp.sum(left, dtype=jnp.int32),
+        waiting=due - jnp.sum(after.queues.next - schedule.start[:-1], dtype=jnp.int32),
+        full=after.queues.full,
+        collided=totals.collided + events(Status.COLLIDED),
+        off_road=totals.off_road + events(Status.OFF_ROAD),
+        wrong_way=totals.wrong_way + events(Status.WRONG_WAY),
+        ran_red=totals.ran_red + events(Status.RED_LIGHT),
+        missed=totals.missed + events(Status.MISSED_ROUTE),
+        hard=totals.hard + events(Status.HARD_BRAKE),
+        broken=totals.broken + events(Status.NOT_FINITE),
+        gridlock=totals.gridlock | (after.active & (after.waiting > GRIDLOCK)).any(),
+        deceleration=jnp.maximum(totals.deceleration, jnp.max(jnp.where(after.active, -after.a, 0))),
+        longest_wait=jnp.maximum(totals.longest_wait, jnp.max(jnp.where(after.active, after.waiting, 0))),
+        distance=totals.distance + jnp.sum(jnp.where(was, driven, 0)),
+        time=totals.time + config.decision_time * jnp.sum(after.active, dtype=jnp.float32),
+        travel_time=totals.travel_time + jnp.sum(jnp.where(left, now - after.entered, 0)),
+    )
+
+
+# --- many worlds -------------------------------------------------------------------------------------
+
+
+def use_all_cores(cores: int | None = None) -> int:
+    """Make every CPU core a device of its own, so that a batch is shared among them.
+
+    Call it before anything runs on the CPU backend; returns the number of devices.
+    """
+    if cores is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    jax.config.update("jax_num_cpu_devices", cores)
+    return jax.local_device_count()
+
+
+def enable_compilation_cache() -> None:
+    """Keep compiled programs on disk, next to the maps' cache, unless JAX was told where already."""
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        jax.config.update("jax_compilation_cache_dir", str(directory() / "xla"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+
+
+def world_key(seed: int | Int[Array, ""]) -> Key[Array, ""]:
+    """The key of a world. All that is random in it is drawn from this, by purpose, entity and step."""
+    return jax.random.fold_in(jax.random.key(0), seed)
+
+
+class Worlds:
+    """Many worlds of one shape: compiled once, run in chunks over all local devices.
+
+    Args:
+      run: the rollout.
+      lane_map: where.
+      sampler: scenario of a world from its key; of the same shapes for all keys.
+      chunk: worlds per call; rounded up to a multiple of the number of devices.
+      devices: all local devices by default.
+    """
+
+    def __init__(
+        self,
+        run: Rollout,
+        lane_map: LaneMap,
+        sampler: Callable[[Key[Array, ""]], Scenario],
+        *,
+        chunk: int = 64,
+        devices: Sequence[Any] | None = None,
+    ) -> None:
+        devices = list(jax.local_devices() if devices is None else devices)
+        if chunk < 1:
+            raise ValueError(f"a chunk of {chunk} worlds? at least 1")
+        self.chunk = -(-chunk // len(devices)) * len(devices)
+        self.mesh = Mesh(np.array(devices), ("worlds",))
+        self.lane_map = jax.device_put(lane_map, jax.sharding.NamedSharding(self.mesh, PartitionSpec()))
+
+        def one(lane_map: LaneMap, seed: Int[Array, ""]) -> Result:
+            scenario_key, policy_key = jax.random.split(world_key(seed))
+            return run(lane_map, sampler(scenario_key), policy_key)
+
+        worlds = PartitionSpec("worlds")
+        self._run: Any = jax.jit(
+            jax.shard_map(
+                jax.vmap(one, in_axes=(None, 0)),
+                mesh=self.mesh,
+                in_specs=(PartitionSpec(), worlds),
+                out_specs=worlds,
+                check_vma=False,
+            )
+        )
+
+    def compile(self) -> Worlds:
+        """Compile now; else the first chunk does."""
+        enable_compilation_cache()
+        self._run = self._run.lower(self.lane_map, jnp.zeros(self.chunk, jnp.int32)).compile()
+        return self
+
+    def chunks(self, seeds: Sequence[int]) -> Iterator[tuple[Sequence[int], Result]]:
+        """Chunk by chunk: its seeds, and the results `[len(seeds), ...]` on the host."""
+        seeds = list(seeds)
+        if not seeds:
+            raise ValueError("no seeds; at least one is needed")
+        if min(seeds) < 0 or max(seeds) >= 2**31:
+            raise ValueError(f"seeds from {min(seeds)} to {max(seeds)}; they must be within 0 and 2^31 - 1")
+        enable_compilation_cache()
+        for first in range(0, len(seeds), self.chunk):
+            some = seeds[first : first + self.chunk]
+            padded = np.array(some + [some[-1]] * (self.chunk - len(some)), np.int32)
+            result = jax.device_get(self._run(self.lane_map, padded))
+            yield some, jax.tree.map(lambda x: x[: len(some)], result)  # noqa: B023
+
+    def run_totals(self, seeds: Sequence[int]) -> Totals:
+        """Totals of all worlds `[len(seeds)]`, on the host."""
+        parts = [result.totals for _, result in self.chunks(seeds)]
+        return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+# --- branching, saving -------------------------------------------------------------------------------
+
+
+def fork(tree: Any, n: int) -> Any:
+    """`n` copies of a world (a state, or state, memory and totals) along a new first axis."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *jnp.shape(x))), tree)
+
+
+def save(path: str | Path, tree: Any) -> None:
+    """Write any pytree of arrays (a state, a carry of `Rollout.go_on`) as .npz; never half a file."""
+    path = Path(path)
+    found = jax.tree_util.tree_leaves_with_path(tree)
+    leaves: dict[str, Any] = {jax.tree_util.keystr(where): np.asarray(x) for where, x in found}
+    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+        try:
+            np.savez(file, **leaves)
+            file.flush()
+            os.fsync(file.fileno())
+            os.replace(file.name, path)
+        except BaseException:
+            os.unlink(file.name)
+            raise
+
+
+def load(path: str | Path, like: Any) -> Any:
+    """Read what `save` wrote into the structure of `like` (of the same shapes).
+
+    Raises:
+      ValueError: an array that is missing or of another shape or type.
+    """
+    with np.load(path) as file:
+        stored = {name: file[name] for name in file.files}
+
+    def read(where: Any, x: Any) -> Any:
+        name = jax.tree_util.keystr(where)
+        if name not in stored:
+            raise ValueError(f"{path}: no array '{name}'")
+        found = stored[name]
+        if found.shape != jnp.shape(x) or found.dtype != jnp.result_type(x):
+            raise ValueError(
+                f"{path}: '{name}' is {found.dtype}{list(found.shape)}, "
+                f"not {jnp.result_type(x)}{list(jnp.shape(x))}"
+            )
+        return jnp.asarray(found)
+
+    return jax.tree_util.tree_map_with_path(read, like)
