@@ -22,12 +22,12 @@ from limsim_jax.maps.routing import default_goals
 from limsim_jax.rollout import Rollout, Worlds, use_all_cores
 from limsim_jax.traffic.demand import Flow, build_demand, entries, sample_scenario
 from limsim_jax.traffic.engine import Traffic
-from limsim_jax.traffic.vehicles import default_population
+from limsim_jax.traffic.vehicles import default_population, fitting
 from limsim_jax.types import Config
 
 RESULTS = Path(__file__).parent / "results"
 
-RATES = {"highway": 4500.0, "ramp": 1500.0, "intersection": 400.0, "roundabout": 400.0, "long_route": 250.0}
+RATES = {"highway": 2000.0, "ramp": 900.0, "intersection": 400.0, "roundabout": 400.0, "long_route": 250.0}
 """veh/h per origin; other maps: `OTHER_RATE`."""
 
 OTHER_RATE = 200.0
@@ -44,9 +44,8 @@ def episodes(
     goals = default_goals(network)
     flows = [Flow(origin=name, rate=rate) for name in entries(network)]
     km = sum(lane.length for lane in network.drivable_lanes() if lane.junction is None) / 1000
-    demand = build_demand(
-        network, lane_map, goals, flows, default_population(), horizon=HORIZON, density=initial / km
-    )
+    population = fitting(default_population(), lane_map)
+    demand = build_demand(network, lane_map, goals, flows, population, horizon=HORIZON, density=initial / km)
     run = Rollout(Config(dt=0.1), Traffic(), HORIZON)
     start = time.perf_counter()
     worlds = Worlds(run, lane_map, lambda key: sample_scenario(demand, lane_map, key, slots), chunk=chunk)

@@ -33,6 +33,7 @@ episode (they go on until whoever runs it stops, see `collided`)."""
 _TILT = 0.5  # rad: the sweep runs at an angle to streets, which mostly run north or east
 _QUANTUM = 16.0  # levels of a sort key per metre
 _FAR = 1e9  # m
+_CLOSE = 4.0  # m: a corner that is farther from the centre is looked up in the map
 
 
 class Contacts(NamedTuple):
@@ -148,8 +149,8 @@ def off_road(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bool[
 
     Traffic that keeps to lanes: from the offset on its lane and the widths of that and the neighbour, not
     counting what a body is wider than its lane. Free egos: every corner of the box, against the lane and
-    its neighbours, else against all lanes of the map. Shoulders are no road, and in a junction only its
-    lanes are.
+    its neighbours, else against the nearest lane of the map. Shoulders are no road, and in a junction only
+    its lanes are; at the edge of the map the road is taken to go on.
     """
     half, own = state.shape.width / 2, width(lane_map, state.lane, state.s) / 2
     edge = jnp.maximum(own, half) + _beside(lane_map, state.lane, state.s, jnp.where(state.d > 0, 1, -1))
@@ -200,8 +201,8 @@ def _corner_off(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bo
     x, y = corner[..., 0], corner[..., 1]
     road = _section(lane_map, state)
 
-    # Offset of the corners if the lane goes on with the curvature that it has here: the error for a body
-    # is far below OVERHANG. Past the ends of the lane, its neighbours do not count.
+    # Offset of the corners if the lane goes on with the curvature that it has here: near the centre, the
+    # error is far below OVERHANG. Past the ends of the lane its neighbours do not count.
     across = (-jnp.sin(road.heading), jnp.cos(road.heading))
     rel_x, rel_y = x - body[:, :1], y - body[:, 1:2]
     ahead = rel_x * across[1][:, None] - rel_y * across[0][:, None]
@@ -212,7 +213,7 @@ def _corner_off(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bo
     s = road.s[:, None] + ahead
     inside = (s >= 0) & (s <= lane_map.length[road.lane][:, None])
     left, right = (road.own[:, None] + jnp.where(inside, w[:, None], 0) for w in (road.left, road.right))
-    off = (d > left) | (d < -right)
+    off = (d > left) | (d < -right) | (rel_x * rel_x + rel_y * rel_y > _CLOSE**2)
 
     # What that leaves open is looked up in the whole map, as long as it would be news.
     known = (state.status[egos.slot] & int(Status.OFF_ROAD)) != 0

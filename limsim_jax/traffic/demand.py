@@ -333,7 +333,7 @@ class _Stream:
 def _streams(world: _World, flow: Flow, number: int, horizon: float) -> list[_Stream]:
     """A flow on all its departure lanes."""
     origins = [flow.origin] if isinstance(flow.origin, str) else list(flow.origin)
-    who = f"flow {number} from {', '.join(map(str, origins[:3]))}"
+    who = f"flow {number} from {_some(origins)}"
     _check_numbers(who, flow)
     if not origins:
         raise ValueError(f"flow {number}: it has no origin")
@@ -409,7 +409,7 @@ def _departure_lanes(world: _World, who: str, origin: str) -> list[int]:
     if len(inwards) == 1:
         return [world.rows[lane] for lane in ways_in[inwards[0]]]
     if both:
-        raise ValueError(f"{who}: road '{origin}' has traffic both ways; say '{both[0]}' or '{both[1]}'")
+        raise ValueError(f"{who}: road '{origin}' has traffic both ways; name one: {_some(both)}")
     lanes = [lane for lane in ways.get(origin, []) if lane.junction is None]
     if not lanes:
         known = ", ".join(list(ways_in or ways)[:5])
@@ -767,7 +767,8 @@ def departure_place(
     lane_map: LaneMap, lane: Int[Array, " V"], length: Float[Array, " V"]
 ) -> Float[Array, " V"]:
     """Front bumper (m) of vehicles that enter where a lane starts: bodies on it, if it is long enough."""
-    return jnp.maximum(jnp.minimum(length, lane_map.length[lane] - 0.5), 0.5 * lane_map.length[lane])
+    most = lane_map.length[lane]
+    return jnp.minimum(length, jnp.maximum(most - 0.5, 0.5 * most))
 
 
 def entry_speed(
@@ -1017,7 +1018,7 @@ def enter(config: Config, lane_map: LaneMap, schedule: Schedule, state: State) -
     }
     gone = ((origin[:, None] == number[None]) & enters[:, None]).any(0)
     queues = Queues(
-        next=state.queues.next + gone,
+        next=state.queues.next + gone.astype(jnp.int32),
         full=state.queues.full + jnp.sum(ready & ~enters, dtype=jnp.int32),
     )
     return replace(state, queues=queues, **changed)

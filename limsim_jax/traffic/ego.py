@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from limsim_jax.geometry import direction, wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, pose, project, side_s, to_frenet, width
@@ -34,7 +34,8 @@ from limsim_jax.types import Config, Egos, State
 _AGAINST = 3.5  # m: a lane is that much less fitting if the ego points against it
 _NOT_AT_ALL = 1e9  # m
 _WANTED = 1e-3  # m by which the lane that is ahead by the route wins over others that fit as well
-_LOST = 0.5  # m off all lanes around from which the lane is looked up in the whole map
+_NEAR = 0.5  # m to an end of a lane from which the next ones are looked at
+_LOST = 0.1  # m off all lanes around from which the lane is looked up in the whole map
 _FOOT = 0.01  # m: a projection that misses the point by more has not found its foot
 _OVER_LINE = 0.1  # m of the body beyond the line from which the lane beside is taken, too
 
@@ -95,7 +96,7 @@ def step_free(config: Config, lane_map: LaneMap, limits: Limits, state: State, c
     most = limits.lateral_acceleration / jnp.maximum(v0 * v0, 0.1)
     dx, dy, turn = _arc(egos.heading, distance, jnp.clip(bend, -most, most), wheelbase)
     x, y, heading = egos.x + dx, egos.y + dy, wrap_angle(egos.heading + turn)
-    place = _find_lane(config, lane_map, state, x, y, heading, distance)
+    place = _find_lane(lane_map, state, x, y, heading, distance)
 
     moves = egos.free & state.active[egos.slot]
 
@@ -173,7 +174,7 @@ def body_place(
 
 
 def _find_lane(
-    config: Config, lane_map: LaneMap, state: State, x: Array, y: Array, heading: Array, distance: Array
+    lane_map: LaneMap, state: State, x: Array, y: Array, heading: Array, distance: Array
 ) -> _Place:
     """Where egos that were on lanes as `state` says are now, having driven `distance` m."""
     slot = state.egos.slot
@@ -188,7 +189,7 @@ def _find_lane(
     wanted = jnp.where(was == start, lane_map.routes.next_lane[start, goal], was)
     best = jnp.argmin(misfit - jnp.where(lanes == wanted[:, None], _WANTED, 0), -1)
     lane, s, misfit = _take(lanes, best), _take(places, best), _take(misfit, best)
-    lost = state.egos.free & state.active[slot] & (misfit > _LOST) & (state.step % config.decision_every == 0)
+    lost = state.egos.free & state.active[slot] & (misfit > _LOST)
     lane, s = _anywhere(lane_map, lost, lane, s, here)
     s, d, along = to_frenet(lane_map, lane, s, x, y)
 
@@ -204,8 +205,8 @@ def _find_lane(
     # The tail may be on the lane before: one of those that we come from, if it leads here.
     before = lane_map.predecessors[lane]
     came = jnp.stack([was_before, start, before[:, 0]], -1)
-    leads = (came[:, :, None] == before[:, None, :]).any(-1)
-    previous = jnp.where(s < 0, NO_LANE, _take(came, jnp.argmax(leads, -1)))
+    leads = (came[:, :, None] == before[:, None, :]).any(-1) & (came != NO_LANE)
+    previous = jnp.where(leads.any(-1) & (s >= 0), _take(came, jnp.argmax(leads, -1)), NO_LANE)
 
     turned = wrap_angle(heading - along)
     half = (jnp.abs(jnp.sin(turned)) * length + jnp.abs(jnp.cos(turned)) * breadth) / 2
@@ -229,7 +230,7 @@ def _around(lane_map: LaneMap, lane: Array, s: Array) -> tuple[Array, Array]:
 
     # lanes that part from where this one starts overlap with it for a while
     parting = padded(lane_map.successors[before[:, 0]])
-    ended, reversed_ = (s > lane_map.length[lane])[:, None], (s < 0)[:, None]
+    ended, reversed_ = (s > lane_map.length[lane] - _NEAR)[:, None], (s < _NEAR)[:, None]
     linked = jnp.where(ended, padded(after), jnp.where(reversed_, padded(before), parting))
     at = _columns(s, linked)
     linked_s = jnp.where(
@@ -273,6 +274,7 @@ def _anywhere(
         x, y, heading = here
         other, other_s, d, _ = project(lane_map, x, y, heading)
         found = lost & (other != NO_LANE) & (jnp.abs(d) <= width(lane_map, other, other_s) / 2)
+        found &= (other_s >= 0) & (other_s <= lane_map.length[other])
         return jnp.zeros_like(lost), jnp.where(found, other, lane), jnp.where(found, other_s, s)
 
     _, lane, s = lax.while_loop(lambda carry: carry[0].any(), look, (lost, lane, s))
@@ -291,9 +293,9 @@ def _take(table: Array, column: Array) -> Array:
 
 
 def at_slots(
-    egos: Egos, value: Float[Array, " E"], into: Float[Array, " N"], which: Bool[Array, " E"] | None = None
-) -> Float[Array, " N"]:
-    """`into` with the values of the egos (those in `which`) in their slots; of any dtype."""
+    egos: Egos, value: Shaped[Array, " E"], into: Shaped[Array, " N"], which: Bool[Array, " E"] | None = None
+) -> Shaped[Array, " N"]:
+    """`into` with the values of the egos (those in `which`) in their slots."""
     if egos.slot.shape[0] == 0:
         return into
     mine = egos.slot[:, None] == jnp.arange(into.shape[0], dtype=egos.slot.dtype)[None, :]

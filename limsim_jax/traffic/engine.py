@@ -90,6 +90,7 @@ class Tick(NamedTuple):
 
     state: State
     left: Bool[Array, " N"]  # has left at the end of its goal in this step
+    time: Float[Array, ""]  # s since the start, after the step
 
 
 @jax.named_scope("decide")
@@ -253,7 +254,7 @@ def drive(
         state, x = carry
         state = replace(state, **fixed)
         state, dx, left = _step(config, traffic, lane_map, state, decision, x, command)
-        out = None if record is None else record(Tick(state, left))
+        out = None if record is None else record(Tick(state, left, state.step.astype(jnp.float32) * config.dt))
         return (bare(state), x + dx), out
 
     before, x = state.lane, jnp.zeros_like(state.s)

@@ -97,7 +97,8 @@ def place_beside(
     after = lane_map.routes.next_lane[state.lane, state.goal]
     beside_after = jnp.where(left, lane_map.left[after], lane_map.right[after])
     needed = jnp.maximum(state.v, CREEP_SPEED) * state.driver.lane_change_time
-    allowed &= (lane_map.length[state.lane] - state.s > needed) | (beside_after != NO_LANE)
+    goes_on = (beside_after != NO_LANE) & ~lane_map.is_connector[after]  # nobody changes in a junction
+    allowed &= (lane_map.length[state.lane] - state.s > needed) | goes_on
     lane = jnp.where(allowed, lane, NO_LANE)
     return lane, side_s(lane_map, state.lane, state.s, side), allowed
 

@@ -58,6 +58,7 @@ _PAIRS = 2  # conflicts that are looked at, per slot; more at once make vehicles
 _EASY = 2.0  # m/s^2, braking from which conflicts ahead matter
 _BITS = 18  # of a sort key, for the position along the connector
 _MARGIN = 0.5  # m between the front bumper and what it waits at
+_YELLOW = 2.5  # s of yellow that are counted on
 _STANDS = 1.0  # m/s, below which the vehicle ahead counts as standing
 
 
@@ -158,7 +159,8 @@ def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, shows: Int[
     n = state.lane.shape[0]
     brake = state.v * state.v / (2 * BRAKE)
 
-    at_light, major = _lights(state, rows, shows)
+    speed = turn_speed(lane_map, rows.lane, driver.a_lat[:, None])
+    at_light, major = _lights(state, rows, speed, shows)
     full = _exit_full(lane_map, state, rows, own)
     standing = (own.lead >= 0) & (state.v[own.lead] < _STANDS) & (state.v < _STANDS)
     queued = standing & (own.lead_gap < 2 * driver.s0 + 1)
@@ -167,7 +169,6 @@ def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, shows: Int[
     def everywhere(x: Array) -> Array:
         return jnp.broadcast_to(x[:, None] if x.ndim == 1 else x, (n, _ROWS)).astype(jnp.float32)
 
-    speed = turn_speed(lane_map, rows.lane, driver.a_lat[:, None])
     a = jnp.maximum(driver.a, 0.5)
     sight = _Sight(
         y=rows.x,
@@ -216,7 +217,9 @@ def _meet(
     tail = jnp.where(state.active & (state.s < state.shape.length), tail, -1)
     first = jax.tree.map(lambda x: x[:, 0], sight)
     first = first._replace(y=state.s + lane_map.length[state.previous], line=jnp.full_like(state.s, -NO_GAP))
-    entries = _Sight(*(jnp.concatenate([x, t[:, None]], -1).ravel() for x, t in zip(sight, first, strict=True)))
+    entries = _Sight(
+        *(jnp.concatenate([x, t[:, None]], -1).ravel() for x, t in zip(sight, first, strict=True))
+    )
     connector = jnp.concatenate([rows.connector, tail[:, None]], -1).ravel()
     count = connector.shape[0]
 
@@ -233,7 +236,9 @@ def _meet(
     busy = jnp.zeros(size, bool).at[jnp.where(connector < 0, size, connector)].set(True, mode="drop")
     reach = rows.x + (state.v * state.v / (2 * _EASY) + 1.5 * state.v + 12)[:, None]
     near = (table.s_in[k] < reach[..., None]) & (table.s_out[k] > (rows.x - sight.length)[..., None])
-    matters = (near & busy[table.foe[k]] & (table.foe[k] >= 0) & (k >= 0)[..., None]).reshape(n * _ROWS, slots)
+    matters = (near & busy[table.foe[k]] & (table.foe[k] >= 0) & (k >= 0)[..., None]).reshape(
+        n * _ROWS, slots
+    )
     number = matters.sum(-1, dtype=jnp.int32)
     begin = jnp.cumsum(number) - number
     most = _PAIRS * n
@@ -364,11 +369,18 @@ def _passes(minor: _Sight, way: _Way, gap: Array, major: _Sight, soon: Array, me
     return (minor.stuck == 0) & (comes_not | (out + gap + loss < soon))
 
 
-def _lights(state: State, rows: Rows, shows: Int[Array, " L"]) -> tuple[Array, Array]:
+def _lights(
+    state: State, rows: Rows, speed: Float[Array, "N R"], shows: Int[Array, " L"]
+) -> tuple[Array, Array]:
     """m to the line where a light says stop, else NO_GAP; and what the light says of priority, [N, R]."""
     light = shows[rows.lane]
     brake = state.v * state.v
-    yellow = (light == SignalState.YELLOW) & (brake[:, None] <= 2 * YELLOW_BRAKE * jnp.maximum(rows.line, 0))
+    line = jnp.maximum(rows.line, 0)
+    # who slows down for a turn comes too late even if it is near
+    late = 2 * line > _YELLOW * (state.v[:, None] + speed)
+    yellow = (light == SignalState.YELLOW) & (
+        brake[:, None] <= 2 * jnp.where(late, 1.5 * YELLOW_BRAKE, YELLOW_BRAKE) * line
+    )
     at_red = (light == SignalState.RED) | (light == SignalState.RED_YELLOW)
     # who cannot stop any more drives on
     red = at_red & (brake[:, None] <= 2 * 0.9 * state.driver.b_max[:, None] * jnp.maximum(rows.line, 0))

@@ -141,39 +141,36 @@ def _departures(
 
 
 def _flow_times(flow: Flow, end: float | None, rng: np.random.Generator) -> list[float]:
-    """Departure times of a flow, s."""
-    last = min((t for t in (flow.end, end) if t is not None), default=math.inf)
-    most = math.inf if flow.number is None else flow.number
+    """Departure times of a flow before `end`, s."""
     rates = (flow.probability, flow.poisson_rate, flow.vehicles_per_hour)
-    if 0 in rates or most == 0:
+    if 0 in (*rates, flow.number):
         return []
-    time, period = flow.begin, flow.period
-    if flow.vehicles_per_hour is not None:
-        period = 3600 / flow.vehicles_per_hour
-    elif rates == (None, None, None) and period is None and last < math.inf:
-        period = ((flow.end or last) - flow.begin) / most  # by number alone
-    if math.isinf(min(most, last)) or (period == 0 and math.isinf(most)) or rates == (None,) * 3 and period is None:
+    until = end if flow.end is None else flow.end
+    period = 3600 / flow.vehicles_per_hour if flow.vehicles_per_hour is not None else flow.period
+    evenly = period is None and rates == (None, None, None)
+    if flow.number is not None and evenly and until is not None:
+        period = (until - flow.begin) / flow.number
+    if (until is None and (flow.number is None or evenly)) or (flow.number is None and period == 0):
         raise MapError(
             "it emits vehicles without end; give it an end, or the scenario",
             file=flow.vehicle.file or None,
             line=flow.vehicle.line,
             element=f"flow {flow.vehicle.id}",
         )
-    if flow.probability is not None:
-        time -= 1  # a chance in the first second, too
-    elif flow.poisson_rate is None:
-        time -= period or 0.0
-    times: list[float] = []
-    while True:
+
+    def gap() -> float:
         if flow.probability is not None:
-            time += rng.geometric(flow.probability)
-        elif flow.poisson_rate is not None:
-            time += rng.exponential(1 / flow.poisson_rate)
-        else:
-            time += period or 0.0
-        if time >= last or len(times) >= most:
-            return times
+            return float(rng.geometric(flow.probability))
+        return period if period is not None else rng.exponential(1 / (flow.poisson_rate or 1.0))
+
+    times: list[float] = []
+    # a chance in the first second, too; at regular times the first vehicle comes at once
+    time = flow.begin + (gap() - 1 if flow.probability is not None else 0.0 if period is not None else gap())
+    last = min((t for t in (flow.end, end) if t is not None), default=math.inf)
+    while time < last and len(times) < (math.inf if flow.number is None else flow.number):
         times.append(time)
+        time += gap()
+    return times
 
 
 def _with_types(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from flax import struct
 from jax.lax import erf, erf_inv
 from jaxtyping import Array, Float, Int, Key
 
-from limsim_jax.maps.lane_map import VEHICLE_CLASSES
+from limsim_jax.maps.lane_map import VEHICLE_CLASSES, LaneMap
 from limsim_jax.maps.network import MapError
 from limsim_jax.maps.sumo_demand import VehicleType
 from limsim_jax.types import Driver, Shape
@@ -357,6 +357,28 @@ def uniform_population(vehicle_class: str = "car", **parameters: float) -> Popul
     rows = {name: _fixed(row.median) for name, row in _default_rows(vehicle_class).items()}
     rows |= {name: _fixed(value) for name, value in parameters.items()}
     return _population([(vehicle_class, 1.0, rows)])
+
+
+SWEEP = 0.6
+"""m, by how much a body may stand out of its path in the tightest bend of a map, see `fitting`."""
+
+
+def fitting(population: Population, lane_map: LaneMap) -> Population:
+    """The population without types that are too long for the bends of a map.
+
+    In a bend of curvature kappa the ends of a body of length l stand out by kappa l^2 / 8. On most urban
+    junctions that leaves trucks and buses no room beside traffic in the next lane; they are drawn no more.
+
+    Raises:
+      ValueError: none fits.
+    """
+    bend = float(np.max(np.asarray(lane_map.curvature_max)))
+    length = np.asarray(population.median)[:, PARAMETERS.index("length")]
+    fits = bend * length * length / 8 <= SWEEP
+    share = np.where(fits, np.asarray(population.share), 0)
+    if not share.any():
+        raise ValueError(f"no vehicle of the population fits into bends of {1 / bend:.1f} m radius")
+    return replace(population, share=jnp.asarray(share, jnp.float32))
 
 
 def from_vtypes(types: Sequence[VehicleType]) -> Population:
