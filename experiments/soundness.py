@@ -32,7 +32,7 @@ RATES = {"highway": 2000.0, "ramp": 900.0, "intersection": 400.0, "roundabout": 
 
 OTHER_RATE = 200.0
 INITIAL = 20  # vehicles at the start, about
-HORIZON = 120.0  # s
+HORIZON = 180.0  # s
 
 
 def episodes(

@@ -35,8 +35,8 @@ from limsim_jax.traffic.engine import Tick, Traffic, drive
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, Scenario, Schedule, State, Status
 
-GRIDLOCK = 90.0
-"""s of standing after which a vehicle counts as stuck, and its world as gridlocked."""
+GRIDLOCK = 120.0
+"""s of standing after which a vehicle counts as stuck, and its world as gridlocked; red lights are shorter."""
 
 
 @struct.dataclass(frozen=True, kw_only=True)

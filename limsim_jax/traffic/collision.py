@@ -149,8 +149,8 @@ def off_road(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bool[
 
     Traffic that keeps to lanes: from the offset on its lane and the widths of that and the neighbour, not
     counting what a body is wider than its lane. Free egos: every corner of the box, against the lane and
-    its neighbours, else against the nearest lane of the map. Shoulders are no road, and in a junction only
-    its lanes are; at the edge of the map the road is taken to go on.
+    its neighbours, else against the nearest lane of the map and its neighbours. Shoulders are no road, and
+    in a junction only its lanes are; at the edge of the map the road is taken to go on.
     """
     half, own = state.shape.width / 2, width(lane_map, state.lane, state.s) / 2
     edge = jnp.maximum(own, half) + _beside(lane_map, state.lane, state.s, jnp.where(state.d > 0, 1, -1))
@@ -222,7 +222,8 @@ def _corner_off(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bo
     def look(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         unsure, off = carry
         lane, s, d, _ = project(lane_map, x, y)
-        on = (lane != NO_LANE) & (jnp.abs(d) <= width(lane_map, lane, s) / 2 + OVERHANG)
+        edge = width(lane_map, lane, s) / 2 + _beside(lane_map, lane, s, jnp.where(d > 0, 1, -1))
+        on = (lane != NO_LANE) & (jnp.abs(d) <= edge + OVERHANG)
         return jnp.zeros_like(unsure), off & ~(unsure & on)
 
     _, off = lax.while_loop(lambda carry: carry[0].any(), look, (unsure, off))

@@ -45,8 +45,8 @@ from limsim_jax.types import Config, Driver, Egos, Lights, Queues, Scenario, Sch
 NEVER = 1e9
 """s, time of the rows of a schedule that nobody uses."""
 
-CHANGE_ROOM = 60.0
-"""m per lane to cross: goals that leave less are not given to who starts or enters there."""
+CHANGE_ROOM, CHANGE_TIME = 60.0, 6.0
+"""m, and s at the speed limit, per lane to cross: who starts or enters is given no goal that leaves less."""
 
 RARE = 1e-9
 """Chance per flow and lane that more vehicles arrive than the schedule has rows for; see `overflow`."""
@@ -80,8 +80,8 @@ class Flow:
     """Vehicles from one or several origins.
 
     The flow of an origin is spread over its lanes: to every goal evenly over those from which it can be
-    reached with `CHANGE_ROOM` per lane to cross (or, if there are none, those with the fewest lanes to
-    cross), in proportion to the share of vehicles that may use the lane.
+    reached with room to change lanes, `CHANGE_ROOM` and `CHANGE_TIME` (or, if there are none, those with
+    the fewest lanes to cross), in proportion to the share of vehicles that may use the lane.
 
     Patterns, each independent on every lane: `poisson`: exponential headways. `uniform`: equal headways
     from a random phase. `platoon`: groups of `platoon` vehicles `headway` s apart, between the groups
@@ -243,6 +243,7 @@ class _World:
     reachable: NDArray[np.bool_]  # [L, G]
     lanes_to_go: NDArray[np.int_]  # [L, G]
     change_distance: NDArray[np.float64]  # [L, G] m
+    speed_limit: NDArray[np.float64]  # [L] m/s
 
     @staticmethod
     def of(
@@ -273,12 +274,14 @@ class _World:
             reachable=np.asarray(lane_map.routes.reachable),
             lanes_to_go=np.asarray(lane_map.routes.lanes_to_go),
             change_distance=np.asarray(lane_map.routes.change_distance, float),
+            speed_limit=np.asarray(lane_map.speed_limit, float),
         )
 
     def leaves_room(self, row: Any, s: Any) -> NDArray[np.bool_]:
-        """Goals `[*b, G]` that leave `CHANGE_ROOM` per lane to cross to who stands at `s` (m) of `row`."""
+        """Goals `[*b, G]` that leave room to change lanes to who is at `s` (m) of `row`."""
         room = self.change_distance[row] - np.asarray(s)[..., None]
-        return self.reachable[row] & (room > CHANGE_ROOM * np.abs(self.lanes_to_go[row]))
+        per_lane = np.maximum(CHANGE_ROOM, CHANGE_TIME * self.speed_limit[row])[..., None]
+        return self.reachable[row] & (room > per_lane * np.abs(self.lanes_to_go[row]))
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,6 @@ from limsim_jax.types import Config, Egos, State
 _AGAINST = 3.5  # m: a lane is that much less fitting if the ego points against it
 _NOT_AT_ALL = 1e9  # m
 _WANTED = 1e-3  # m by which the lane that is ahead by the route wins over others that fit as well
-_NEAR = 0.5  # m to an end of a lane from which the next ones are looked at
 _LOST = 0.1  # m off all lanes around from which the lane is looked up in the whole map
 _FOOT = 0.01  # m: a projection that misses the point by more has not found its foot
 _OVER_LINE = 0.1  # m of the body beyond the line from which the lane beside is taken, too
@@ -221,29 +220,27 @@ def _find_lane(
 
 
 def _around(lane_map: LaneMap, lane: Array, s: Array) -> tuple[Array, Array]:
-    """Lanes on which a body that was at `s` (m) on `lane` can be now, and where about: `[E, C]`."""
+    """Lanes on which a body near `s` (m) on `lane` can be: that one, beside it, past its nearer end.
+
+    And where on them, m; `[E, C]`.
+    """
     before, after = lane_map.predecessors[lane], lane_map.successors[lane]
     count = max(before.shape[-1], after.shape[-1])
 
     def padded(lanes: Array) -> Array:
         return jnp.pad(lanes, ((0, 0), (0, count - lanes.shape[-1])), constant_values=NO_LANE)
 
-    # lanes that part from where this one starts overlap with it for a while
-    parting = padded(lane_map.successors[before[:, 0]])
-    ended, reversed_ = (s > lane_map.length[lane] - _NEAR)[:, None], (s < _NEAR)[:, None]
-    linked = jnp.where(ended, padded(after), jnp.where(reversed_, padded(before), parting))
-    at = _columns(s, linked)
-    linked_s = jnp.where(
-        ended, at - lane_map.length[lane][:, None], jnp.where(reversed_, at + lane_map.length[linked], at)
-    )
-    left, right, opposite = lane_map.left[lane], lane_map.right[lane], lane_map.opposite[lane]
-    share = safe_divide(s, lane_map.length[lane])
-    lanes = jnp.stack([lane, left, right, opposite], -1)
+    length = lane_map.length[lane]
+    ahead = (s > length / 2)[:, None]
+    linked = jnp.where(ahead, padded(after), padded(before))
+    linked_s = _columns(s, linked) + jnp.where(ahead, -length[:, None], lane_map.length[linked])
+    opposite = lane_map.opposite[lane]
+    lanes = jnp.stack([lane, lane_map.left[lane], lane_map.right[lane], opposite], -1)
     places = [
         s,
         side_s(lane_map, lane, s, jnp.ones_like(lane)),
         side_s(lane_map, lane, s, -jnp.ones_like(lane)),
-        (1 - share) * lane_map.length[opposite],
+        (1 - s / length) * lane_map.length[opposite],
     ]
     return jnp.concatenate([lanes, linked], -1), jnp.concatenate([jnp.stack(places, -1), linked_s], -1)
 
@@ -410,6 +407,7 @@ _LOOK = 0.8  # s: the lateral error fades with v * _LOOK m as its length scale .
 _LEAST_LOOK = 3.0  # m: ... but no less
 _SETTLE = 1.0  # s: the longitudinal error fades with this time constant
 _CLEAR = 0.5  # m: samples farther apart than that tell the direction of the path
+_LATE = 0.5  # m/s: a place that should be passed a second sooner or later counts as that much farther away
 
 
 def track(
@@ -418,27 +416,31 @@ def track(
     """Control that follows a trajectory, at time `t` (s).
 
     Curvature of the path ahead plus feedback of lateral offset e and course error f over the distance,
-    kappa = kappa_ref - 2 f / l - e / l^2: both poles of the linearised error at -1 / l. Along the path,
-    a = a_ref + 2 (v_ref - v) / T + ahead / T^2. What is ahead in time makes up for the lags of the
+    kappa = kappa_ref - 2 f / l - e / l^2: both poles of the linearised error at -1 / l. They are those to
+    the nearest place on the path, wherever the ego should be by now. Along the path,
+    a = a_ref + 2 (v_ref - v) / T + behind / T^2. What is ahead in time makes up for the lags of the
     actuators. After its end a trajectory goes on straight with its last speed.
     """
     egos = state.egos
     v, wheelbase = state.v[egos.slot], state.shape.wheelbase[egos.slot]
     now = jnp.broadcast_to(jnp.asarray(t, v.dtype), v.shape)
-    x, y, course, v_ref, _, _ = _sample(trajectory, now)
-    ahead = (x - egos.x) * jnp.cos(course) + (y - egos.y) * jnp.sin(course)
-    lag = limits.acceleration_lag + config.dt / 2
-    *_, a_ref = _sample(trajectory, now + lag)
-    a = a_ref + 2 * (v_ref - v) / _SETTLE + ahead / _SETTLE**2
 
-    # steer for the place on the path that is level with the ego, wherever it should be by now
-    level = now - ahead / jnp.maximum(v_ref, 1)
-    x, y, course, _, _, _ = _sample(trajectory, level)
-    offset = (egos.y - y) * jnp.cos(course) - (egos.x - x) * jnp.sin(course)
+    time = trajectory.t0 + trajectory.dt * jnp.arange(trajectory.x.shape[-1], dtype=v.dtype)
+    away = (trajectory.x - egos.x[:, None]) ** 2 + (trajectory.y - egos.y[:, None]) ** 2
+    near = time[jnp.argmin(away + (_LATE * (time[None, :] - now[:, None])) ** 2, -1)]
+    place = _sample(trajectory, near)
+    along = (egos.x - place.x) * jnp.cos(place.course) + (egos.y - place.y) * jnp.sin(place.course)
+    level = near + along / jnp.maximum(place.v, 1)
+    here, goal = _sample(trajectory, level), _sample(trajectory, now)
+    behind = goal.way - (place.way + along)
+    a = _sample(trajectory, now + limits.acceleration_lag + config.dt / 2).a
+    a = a + 2 * (goal.v - v) / _SETTLE + behind / _SETTLE**2
+
+    offset = (egos.y - here.y) * jnp.cos(here.course) - (egos.x - here.x) * jnp.sin(here.course)
     slip = jnp.arctan(jnp.tan(egos.steering) / 2)  # the centre does not move where the body points
-    error = wrap_angle(egos.heading + slip - course)
-    *_, bend, _ = _sample(trajectory, level + limits.steering_lag + config.dt / 2)
+    error = wrap_angle(egos.heading + slip - here.course)
     look = jnp.maximum(v * _LOOK, _LEAST_LOOK)
+    bend = _sample(trajectory, level + limits.steering_lag + config.dt / 2).bend
     bend = bend - 2 * error / look - offset / look**2
     # of the centre's path: sin(slip) = bend * wheelbase / 2, and tan(steering) = 2 tan(slip)
     sine = jnp.clip(bend * wheelbase / 2, -0.9, 0.9)
@@ -456,20 +458,31 @@ class _Sample(NamedTuple):
     v: Float[Array, " E"]
     bend: Float[Array, " E"]  # 1/m
     a: Float[Array, " E"]
+    way: Float[Array, " E"]  # m from the first sample
 
 
 def _sample(trajectory: Trajectory, time: Float[Array, " E"]) -> _Sample:
     """The trajectory at a time (s) of each ego."""
     dt, count = trajectory.dt, trajectory.x.shape[-1]
+    steps = jnp.stack([jnp.diff(trajectory.x), jnp.diff(trajectory.y)], -1)
+    chords = safe_norm(steps)
+    way = jnp.cumsum(chords, -1)
     place = (time - trajectory.t0) / dt
     k = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 2)
     u = jnp.clip(place - k.astype(place.dtype), 0, 1)
-    (x0, x1), (y0, y1), (h0, h1), (v0, v1) = (
-        (_take(values, k), _take(values, k + 1))
-        for values in (trajectory.x, trajectory.y, trajectory.heading, trajectory.v)
+    x0, y0, v0, v1, h0, h1 = (
+        _take(values, k + n)
+        for values, n in (
+            (trajectory.x, 0), (trajectory.y, 0), (trajectory.v, 0), (trajectory.v, 1),
+            (trajectory.heading, 0), (trajectory.heading, 1),
+        )
+    )  # fmt: skip
+    turn, dx, dy, chord = (
+        wrap_angle(h1 - h0),
+        _take(steps[..., 0], k),
+        _take(steps[..., 1], k),
+        _take(chords, k),
     )
-    turn, dx, dy = wrap_angle(h1 - h0), x1 - x0, y1 - y0
-    chord = safe_norm(jnp.stack([dx, dy], -1))
     clear = jnp.clip(chord / _CLEAR, 0, 1)
     course = h0 + u * turn + clear * wrap_angle(direction(dx, dy) - h0 - turn / 2)
     v = v0 + u * (v1 - v0)
@@ -483,6 +496,7 @@ def _sample(trajectory: Trajectory, time: Float[Array, " E"]) -> _Sample:
         v=v,
         bend=jnp.where(inside, turn / jnp.maximum(chord, 0.1), 0),
         a=jnp.where(inside, (v1 - v0) / dt, 0),
+        way=_take(way, k) - (1 - u) * chord + rest,
     )
 
 

@@ -53,12 +53,12 @@ from limsim_jax.types import Config, Schedule, State, Status
 PATIENCE = 10.0
 """s of waiting at the end of a wrong lane before a driver gives up the route."""
 
-AT_END = 20.0
+AT_END = 40.0
 """m from the end of a lane within which that counts."""
 
 _BEND_POINTS = 4  # places ahead on the own lane at which the bend is looked at
 _WALL = 1.0  # m before the end of a lane that leads nowhere
-_WALL_ROOM = 12.0  # m before it, kept free to change lanes from a standstill
+_WALL_ROOM = 25.0  # m before it, kept free to change lanes from a standstill
 
 
 @dataclass(frozen=True)
@@ -308,6 +308,5 @@ def _step(
 def _ran_red(lane_map: LaneMap, state: State, before: Int[Array, " N"]) -> State:
     """Record who has crossed a stop line on red since the decision, when it was on lane `before`."""
     red = lane_states(lane_map.signals, state.lights.phase) == SignalState.RED
-    entered = (state.lane != before) & state.active
-    ran = entered & (red[state.lane] | (red[state.previous] & (state.previous != before)))
+    ran = state.active & (state.lane != before) & red[state.lane]  # nobody changes lanes behind a light
     return replace(state, status=state.status | jnp.where(ran, int(Status.RED_LIGHT), 0))

@@ -23,9 +23,10 @@ from limsim_jax.types import Config, State, Status
 WALKING_SPEED = 1.5
 """m/s, below which a vehicle counts as waiting."""
 
-CREEP_SPEED = 2.0
+CREEP_SPEED = 5.0
 """m/s, below which a lane change goes on by distance, not by time: what stands does not slide."""
 
+_MOST_TURNED = 0.2  # rad against the lane in a lane change: the ends of long bodies stay near theirs
 _HAND_OVERS = 3  # lanes that a vehicle may leave behind in one step
 _APPROACH = 0.7  # of the comfortable deceleration: used to slow down for a bend ahead
 
@@ -202,4 +203,5 @@ def boxes(lane_map: LaneMap, state: State) -> Float[Array, "N 5"]:
     s = jnp.where(behind, s + lane_map.length[state.previous], s)
     x, y, heading = pose(lane_map, lane, s, state.d)
     turned = jnp.arctan2(lateral_speed(state), jnp.maximum(state.v, 0.5))
+    turned = jnp.clip(turned, -_MOST_TURNED, _MOST_TURNED)
     return overlay_boxes(state, jnp.stack([x, y, heading + turned, shape.length, shape.width], -1))

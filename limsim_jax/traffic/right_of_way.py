@@ -77,7 +77,7 @@ class Yielding(NamedTuple):
     stop: Float[Array, " N"]  # m to where the front bumper has to stop, NO_GAP if nowhere
     lead: Int[Array, " N"]  # slot of a vehicle to follow through a merge or a split, -1 for none
     lead_gap: Float[Array, " N"]  # m to it
-    held: Bool[Array, " N"]  # kept before a junction, not by a light
+    held: Bool[Array, " N"]  # kept by the right of way, a sign or a full exit, not by a light
     stopped: Bool[Array, " N"]  # has stopped at the stop sign ahead
 
 
@@ -164,6 +164,7 @@ def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, shows: Int[
     full = _exit_full(lane_map, state, rows, own)
     standing = (own.lead >= 0) & (state.v[own.lead] < _STANDS) & (state.v < _STANDS)
     queued = standing & (own.lead_gap < 2 * driver.s0 + 1)
+    queued |= (state.v < _STANDS) & (state.waiting > WAITED) & ~state.held  # whatever it waits for
     sign, stopped = _stop_sign(lane_map, state, rows)
 
     def everywhere(x: Array) -> Array:
@@ -285,6 +286,10 @@ def _meet(
     s0, T, b = (x[vehicle][:, None] for x in (driver.s0, driver.T, driver.b))
     reach = behind + other.v * other.v / (2 * b)
     follows = waits & merges & (((behind > s0 + 0.5 * T * me.v) & (reach > distance_in)) | (distance_in <= 0))
+    # keep clear: nobody enters behind a slow vehicle only to stand where others cross
+    clear = (table.cross_s[k][:, None] - me.y) + me.length + s0
+    stands = (table.cross_s[k][:, None] > 0) & (me.line > -_MARGIN) & (other.v < 2 * _STANDS)
+    follows &= ~(stands & (behind < clear))
     taken = (waits & ~follows).any(-1)
     until = jnp.where(taken, distance_in[:, 0], NO_GAP)
     until = jnp.full(n * _ROWS, NO_GAP, jnp.float32).at[row].min(until)
@@ -329,8 +334,8 @@ def _goes_first(
 ) -> Array:
     """Whether `me` goes before `foe`: the negation of the same with the roles swapped."""  # fmt: skip
     in_me, in_foe = mine.start - me.y, theirs.start - foe.y
-    level_me = (in_me <= 0).astype(jnp.int32) + (in_me < me.brake)
-    level_foe = (in_foe <= 0).astype(jnp.int32) + (in_foe < foe.brake)
+    level_me = (in_me <= 0).astype(jnp.int32) + (in_me < me.brake).astype(jnp.int32)
+    level_foe = (in_foe <= 0).astype(jnp.int32) + (in_foe < foe.brake).astype(jnp.int32)
     soon_me, soon_foe = travel_time(in_me, me.v, me.fast, me.a), travel_time(in_foe, foe.v, foe.fast, foe.a)
     before = me.slot < foe.slot
     # both inside, or both unable to stop: who is further on
@@ -344,7 +349,7 @@ def _goes_first(
     both = jnp.minimum(me.wait, foe.wait)
     rank = jnp.where((tie != 0) & (both < WAITED), tie > 0, longer)
     light = jnp.sign(me.major - foe.major)
-    order = jnp.where(light != 0, light, prio)
+    order = jnp.where(light != 0, light, prio.astype(light.dtype))
     kept = (me.held > 0) & (foe.held > 0) & (both > STUCK)
     major = jnp.where(kept, longer, jnp.where(order != 0, order > 0, rank))
     # and whether the other has the time to pass before
@@ -384,11 +389,11 @@ def _lights(
     at_red = (light == SignalState.RED) | (light == SignalState.RED_YELLOW)
     # who cannot stop any more drives on
     red = at_red & (brake[:, None] <= 2 * 0.9 * state.driver.b_max[:, None] * jnp.maximum(rows.line, 0))
-    stops = (yellow | red) & (rows.line > -_MARGIN) & (rows.connector >= 0)
+    stops = (yellow | red) & (rows.x < 0) & (rows.line > -NO_GAP / 2) & (rows.connector >= 0)
     minor = (light == SignalState.GREEN_MINOR) | (light == SignalState.STOP)
     major = jnp.where(light == SignalState.GREEN_MAJOR, 1, jnp.where(minor, -1, 0))
     left_over = (rows.line < -_MARGIN) & (at_red | (light == SignalState.YELLOW))  # clears the junction first
-    return jnp.where(stops, rows.line - _MARGIN, NO_GAP), jnp.where(left_over, 2, major)
+    return jnp.where(stops, jnp.maximum(rows.line - _MARGIN, 0), NO_GAP), jnp.where(left_over, 2, major)
 
 
 def _exit_full(lane_map: LaneMap, state: State, rows: Rows, own: Pair) -> Bool[Array, "N R"]:
@@ -415,7 +420,7 @@ def _where_to_stop(
     until: Float[Array, "N R"],
     barred: Bool[Array, "N R"],
 ) -> tuple[Float[Array, "N R"], Bool[Array, "N R"]]:
-    """m to where the front bumper waits, NO_GAP if it need not; and whether that is before the conflicts."""
+    """m to where the front bumper waits, NO_GAP if it need not; and whether it has to."""
     taken = until < NO_GAP / 2
     until = until - _MARGIN
     # all that is taken may lie beyond the point to wait at within the junction
@@ -426,4 +431,4 @@ def _where_to_stop(
     line = jnp.maximum(rows.line - _MARGIN, 0)
     stop = jnp.where(taken, jnp.where(at_line & ~beyond, jnp.minimum(line, until), until), NO_GAP)
     stop = jnp.where(barred & at_line, jnp.minimum(stop, line), stop)
-    return stop, (taken | barred) & (at_line | beyond)
+    return stop, taken | barred

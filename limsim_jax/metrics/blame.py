@@ -1,0 +1,338 @@
+"""Contacts: what kind, who is at fault, and whether braking would have helped.
+
+**Type and fault** follow nuPlan (`nuplan-devkit`, `no_ego_at_fault_collisions.py`). The first rule that
+holds decides; a body counts once.
+
+=================  ===========================================================  ==========================
+type               rule                                                         ego at fault
+=================  ===========================================================  ==========================
+STOPPED_EGO        ego's speed <= 0.05 m/s                                      no
+STOPPED_OTHER      other's speed <= 0.05 m/s                                    yes
+REAR               centre of the other > 150 degrees off the ego's heading,     no
+                   seen from the ego's rear axle
+FRONT              the ego's front edge touches the other                       yes
+LATERAL            else                                                         if in several lanes or off
+                                                                                the drivable area
+=================  ===========================================================  ==========================
+
+**Responsibility** (`Responsibility`) goes further, symmetrically for both. A vehicle is a *hazard* from
+the first step of the latest unbroken time in which the 2-D TTC with it was at most `HAZARD` s. At that
+step three things are noted for both sides: whether full braking (`b_max`, at once, along its heading)
+would have avoided the contact if the other one had kept its velocity (`avoidable_by_braking`), and
+whether it was in several lanes. A side is responsible if
+
+1. it broke a rule that gives the other priority (red light, wrong way, right of way), or
+2. it is at fault by its type, and braking would have avoided the contact or it was changing lanes itself;
+   but not who keeps to its lane and meets the front or the side of one that is changing lanes, or
+3. it was changing lanes and that left the other one no way to avoid the contact by braking.
+
+Both: SHARED. None: UNAVOIDABLE, there was no braking that would have avoided it from the first moment at
+which the other was a hazard, and nobody had broken a rule or made the hazard by a change of lanes.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from limsim_jax.metrics.reductions import Measured, measured
+from limsim_jax.metrics.safety import (
+    Encounter,
+    delta_v,
+    first_touch,
+    greater,
+    lesser,
+    mirrored,
+    overlaps,
+    reach,
+)
+
+STOPPED = 0.05
+"""m/s: nuPlan's bound on the speed of what stands."""
+
+HAZARD = 3.0
+"""s: a vehicle with a TTC of at most this is a hazard."""
+
+
+class ContactType(enum.IntEnum):
+    """How the ego met the other one, from the ego's side."""
+
+    NONE = 0
+    STOPPED_EGO = 1
+    STOPPED_OTHER = 2
+    FRONT = 3
+    REAR = 4
+    LATERAL = 5
+
+
+class Responsibility(enum.IntEnum):
+    """Who is to blame for a contact."""
+
+    NONE = 0
+    EGO = 1
+    OTHER = 2
+    SHARED = 3
+    UNAVOIDABLE = 4
+
+
+def ahead(e: Encounter, rear_axle: Float[Array, "*#b"]) -> Bool[Array, "*b"]:
+    """Whether the other's centre is within 30 degrees of the ego's heading, seen from its rear axle.
+
+    `rear_axle`: from the centre of the ego back to the axle, m.
+    """
+    x = e.x + rear_axle
+    return (x > 0) & (x * x > 3 * e.y * e.y)  # tan(30 degrees)^2 = 1/3
+
+
+def behind(e: Encounter, rear_axle: Float[Array, "*#b"]) -> Bool[Array, "*b"]:
+    """Whether it is more than 150 degrees off the ego's heading."""
+    x = e.x + rear_axle
+    return (x < 0) & (x * x > 3 * e.y * e.y)
+
+
+def contact_type(
+    e: Encounter,
+    v: Float[Array, "*b"],
+    v_other: Float[Array, "*b"],
+    rear_axle: Float[Array, "*#b"],
+) -> Int[Array, "*b"]:
+    """`ContactType` of boxes that touch; `v`, `v_other`: their speeds, m/s."""
+    # the front edge is a box without length
+    edge = e._replace(x=e.x - e.length / 2, length=jnp.zeros_like(e.length))
+    kind = jnp.where(overlaps(edge), int(ContactType.FRONT), int(ContactType.LATERAL))
+    kind = jnp.where(behind(e, rear_axle), int(ContactType.REAR), kind)
+    kind = jnp.where(jnp.abs(v_other) <= STOPPED, int(ContactType.STOPPED_OTHER), kind)
+    return jnp.where(jnp.abs(v) <= STOPPED, int(ContactType.STOPPED_EGO), kind)
+
+
+def at_fault(kind: Int[Array, "*b"], several_lanes: Bool[Array, "*#b"]) -> Bool[Array, "*b"]:
+    """Whether nuPlan blames the ego; `several_lanes`: its corners are in several lanes or off the road."""
+    lateral = (kind == int(ContactType.LATERAL)) & several_lanes
+    return (kind == int(ContactType.FRONT)) | (kind == int(ContactType.STOPPED_OTHER)) | lateral
+
+
+def avoidable_by_braking(
+    e: Encounter, v: Float[Array, "*#b"], b_max: Float[Array, "*#b"]
+) -> Bool[Array, "*b"]:
+    """Whether the ego at speed `v` avoids the other by braking with `b_max` along its heading from now on.
+
+    The other keeps its velocity. In the ego's axes it is beside nobody's path while its shadow on y is
+    apart from the ego's, that is but for an interval of time; there, with x the distance of the centres
+    ahead, `x(t) = x0 + u_o t - (v t - b t^2 / 2)` until the ego stands, then a line. x is convex, so its
+    values in the interval lie between its least (at an end or where the speeds are equal) and the
+    greater of those at the ends; the boxes meet if that range meets [-E, E], E their half lengths along
+    x together. An oblique box counts with its bounding box in the ego's axes.
+    """
+    along, across = reach(e)
+    v = jnp.broadcast_to(v, e.x.shape)
+    speed = jnp.where(v > 0, v, 0)
+    brake = jnp.broadcast_to(b_max, e.x.shape)
+    zero = jnp.zeros_like(e.x)
+    horizon = jnp.full_like(e.x, 30.0)  # s: by then who brakes stands
+    # when the other is in the way
+    still = jnp.abs(e.w) < 1e-6
+    inverse = 1 / jnp.where(still, 1.0, e.w)
+    middle, half = -e.y * inverse, across * jnp.abs(inverse)
+    low = jnp.where(still, 0, greater(middle - half, zero))
+    high = jnp.where(still, jnp.where(jnp.abs(e.y) <= across, horizon, -1), lesser(middle + half, horizon))
+    other_speed = e.u + v
+    stop = speed / brake
+
+    def x(t: Float[Array, "*b"]) -> Float[Array, "*b"]:
+        moving = lesser(t, stop)
+        return e.x + other_speed * t - (speed - brake / 2 * moving) * moving
+
+    equal = jnp.where(other_speed < 0, high, (speed - other_speed) / brake)
+    least = x(greater(lesser(equal, high), low))
+    most = greater(x(low), x(high))
+    meets = (high >= low) & (least <= along) & (most >= -along)
+    return ~meets
+
+
+class Onset(NamedTuple):
+    """How a hazard began."""
+
+    avoidable: Bool[Array, "*b"]  # by the ego's braking
+    other_avoidable: Bool[Array, "*b"]  # by the other's braking
+    changing: Bool[Array, "*b"]  # the ego was in several lanes
+    other_changing: Bool[Array, "*b"]
+
+
+class ContactCarry(NamedTuple):
+    """What `contact_update` remembers. The worst new contact of the first step with any is described."""
+
+    notes: Int[Array, " N"]  # bits: `Onset`, then is a hazard, has touched the ego since it entered
+    contacts: Int[Array, ""]
+    faults: Int[Array, ""]  # those at fault by nuPlan's rules
+    fault_now: Bool[Array, ""]  # one of them in this step
+    time: Float[Array, ""]  # s, of the first contact
+    other: Int[Array, ""]  # slot of the other, -1 for none
+    kind: Int[Array, ""]  # ContactType
+    fault: Bool[Array, ""]
+    responsibility: Int[Array, ""]
+    severity: Float[Array, ""]  # m/s, delta-v
+    most_severe: Float[Array, ""]  # m/s, of all contacts
+
+    @property
+    def touched(self) -> Bool[Array, " N"]:
+        """Who has touched the ego since it entered."""
+        return (self.notes & _TOUCHED) > 0
+
+
+_HAZARD, _TOUCHED = 16, 32
+_SLOTS = 2**12  # slots at most, in the low bits of a key
+_SEVERITY = 16.0  # steps per m/s in a key, up to 256 m/s
+
+
+def contact_init(vehicles: int) -> ContactCarry:
+    """No contact, no hazard. Raises `ValueError` for more than 4096 slots."""
+    if vehicles > _SLOTS:
+        raise ValueError(f"{vehicles} slots; contacts are told apart for up to {_SLOTS}")
+    zero, none, no = jnp.zeros(()), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    return ContactCarry(
+        notes=jnp.zeros(vehicles, jnp.int32),
+        contacts=none,
+        faults=none,
+        fault_now=no,
+        time=zero,
+        other=none - 1,
+        kind=none,
+        fault=no,
+        responsibility=none,
+        severity=zero,
+        most_severe=zero,
+    )
+
+
+def responsibility(
+    *,
+    kind: Int[Array, "*b"],
+    other_kind: Int[Array, "*b"],
+    violation: Bool[Array, "*b"],
+    other_violation: Bool[Array, "*b"],
+    onset: Onset,
+) -> Int[Array, "*b"]:
+    """`Responsibility` by the rules of this module; `other_kind` is the type from the other's side."""
+
+    def to_blame(
+        kind: Int[Array, "*b"],
+        met: Int[Array, "*b"],
+        violation: Bool[Array, "*b"],
+        changing: Bool[Array, "*b"],
+        avoidable: Bool[Array, "*b"],
+        met_changing: Bool[Array, "*b"],
+        met_avoidable: Bool[Array, "*b"],
+    ) -> Bool[Array, "*b"]:
+        driven_into = (met == int(ContactType.FRONT)) | (met == int(ContactType.LATERAL))
+        excused = met_changing & ~changing & driven_into
+        by_type = at_fault(kind, changing) & (avoidable | changing) & ~excused
+        return violation | by_type | (changing & ~met_avoidable)
+
+    mine = (onset.changing, onset.avoidable)
+    theirs = (onset.other_changing, onset.other_avoidable)
+    ego = to_blame(kind, other_kind, violation, *mine, *theirs)
+    other = to_blame(other_kind, kind, other_violation, *theirs, *mine)
+    one = jnp.where(ego, int(Responsibility.EGO), int(Responsibility.UNAVOIDABLE))
+    two = jnp.where(ego, int(Responsibility.SHARED), int(Responsibility.OTHER))
+    return jnp.where(other, two, one)
+
+
+def contact_update(
+    carry: ContactCarry,
+    *,
+    t: Float[Array, ""],
+    e: Encounter,
+    begin: Float[Array, " N"],
+    cease: Float[Array, " N"],
+    there: Bool[Array, " N"],
+    v: Float[Array, ""],
+    v_others: Float[Array, " N"],
+    changing: Bool[Array, ""],
+    others_changing: Bool[Array, " N"],
+    violation: Bool[Array, ""],
+    other_violations: Bool[Array, " N"],
+    rear_axle: Float[Array, ""],
+    b_max: Float[Array, ""],
+    others_b_max: Float[Array, " N"],
+) -> ContactCarry:
+    """One step of one ego among `N` others (`there`: not the ego itself, not an empty slot).
+
+    `begin`, `cease`: `safety.contact_interval` of `e`. A slot must be seen empty before another vehicle
+    counts as new in it. The rear axle of the others is taken to be where the ego's is.
+    """
+    v_ego = jnp.broadcast_to(v, there.shape)
+    hazard = there & (first_touch(begin, cease) <= HAZARD)
+    onset = (
+        avoidable_by_braking(e, v, b_max),
+        avoidable_by_braking(mirrored(e), v_others, others_b_max),
+        jnp.broadcast_to(changing, there.shape),
+        others_changing,
+    )
+    fresh = sum((jnp.where(flag, 1 << k, 0) for k, flag in enumerate(onset)), jnp.zeros_like(carry.notes))
+    goes_on = (carry.notes & _HAZARD) > 0
+    touching = there & (begin <= 0) & (cease >= 0)
+    new = touching & ~carry.touched
+    notes = jnp.where(goes_on, carry.notes, fresh) & (_HAZARD - 1)
+    notes |= jnp.where(hazard, _HAZARD, 0)
+    notes |= jnp.where(there & (touching | carry.touched), _TOUCHED, 0)
+
+    fault = at_fault(contact_type(e, v_ego, v_others, rear_axle), changing)
+    severity = delta_v(v_ego, v_others, e.cos)
+    number = jnp.sum(new, dtype=jnp.int32)
+    faults = jnp.sum(new & fault, dtype=jnp.int32)
+    # the worst of contacts in one step, by a key: at fault first, then the hardest, then the slot
+    slots = jnp.arange(there.shape[0], dtype=jnp.int32)
+    rank = (severity * _SEVERITY).astype(jnp.int32) + jnp.where(fault, 2**13, 0)
+    worst = jnp.max(jnp.where(new, rank * _SLOTS + slots, 0)) % _SLOTS
+    pair: Encounter = jax.tree.map(lambda x: x[worst], e)
+    kind = contact_type(pair, v, v_others[worst], rear_axle)
+    other_kind = contact_type(mirrored(pair), v_others[worst], v, rear_axle)
+    began = Onset(*((notes[worst] & (1 << k)) > 0 for k in range(4)))
+    blame = responsibility(
+        kind=kind,
+        other_kind=other_kind,
+        violation=violation,
+        other_violation=other_violations[worst],
+        onset=began._replace(
+            changing=began.changing | changing,
+            other_changing=began.other_changing | others_changing[worst],
+        ),
+    )
+    first = (number > 0) & (carry.contacts == 0)
+    return ContactCarry(
+        notes=notes,
+        contacts=carry.contacts + number,
+        faults=carry.faults + faults,
+        fault_now=faults > 0,
+        time=jnp.where(first, t, carry.time),
+        other=jnp.where(first, worst, carry.other),
+        kind=jnp.where(first, kind, carry.kind),
+        fault=jnp.where(first, at_fault(kind, changing), carry.fault),
+        responsibility=jnp.where(first, blame, carry.responsibility),
+        severity=jnp.where(first, severity[worst], carry.severity),
+        most_severe=jnp.maximum(carry.most_severe, jnp.max(jnp.where(new, severity, 0))),
+    )
+
+
+def contact_result(carry: ContactCarry) -> dict[str, Measured]:
+    """Counts, and what is known of the first contact; its numbers are invalid without one."""
+    any_contact = carry.contacts > 0
+
+    def number(x: Array) -> Float[Array, ""]:
+        return x.astype(carry.time.dtype)
+
+    return {
+        "contacts": measured(number(carry.contacts)),
+        "at_fault_contacts": measured(number(carry.faults)),
+        "contact_time": measured(carry.time, any_contact),
+        "contact_other": measured(number(carry.other), any_contact),
+        "contact_type": measured(number(carry.kind), any_contact),
+        "contact_at_fault": measured(number(carry.fault), any_contact),
+        "contact_responsibility": measured(number(carry.responsibility), any_contact),
+        "contact_delta_v": measured(carry.severity, any_contact),
+        "max_delta_v": measured(carry.most_severe, any_contact),
+    }

@@ -1,0 +1,106 @@
+"""What a scan carries instead of a trace: means, extremes, episodes.
+
+Every one starts empty, takes one sample a step and ends as a `Measured`: a finite number and whether
+there was anything to measure. Samples that are masked out may be NaN.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from limsim_jax.numerics import safe_divide
+
+
+class Measured(NamedTuple):
+    """A number, and whether it means anything. Where it does not, it is 0."""
+
+    value: Float[Array, "*b"]
+    valid: Bool[Array, "*b"]
+
+
+def measured(value: Float[Array, "*b"], valid: Bool[Array, "*b"] | bool = True) -> Measured:
+    """`value` where `valid`, else 0."""
+    valid = jnp.broadcast_to(jnp.asarray(valid), value.shape)
+    return Measured(jnp.where(valid, value, 0), valid)
+
+
+def on_host(results: dict[str, Measured]) -> dict[str, Any]:
+    """NumPy copies for a table: floats for one world, arrays for a batch; None or NaN where invalid."""
+    row: dict[str, Any] = {}
+    for name, (value, valid) in results.items():
+        number = np.where(np.asarray(valid), np.asarray(value, np.float64), np.nan)
+        row[name] = number if number.ndim else (float(number) if valid else None)
+    return row
+
+
+class Mean(NamedTuple):
+    """Weighted mean of the samples so far."""
+
+    total: Float[Array, "*b"]
+    weight: Float[Array, "*b"]
+
+    @classmethod
+    def empty(cls, *shape: int) -> Mean:
+        """Of no samples."""
+        return cls(jnp.zeros(shape), jnp.zeros(shape))
+
+    def add(
+        self, x: Float[Array, "*b"], where: Bool[Array, "*b"], weight: Float[Array, "*b"] | float = 1.0
+    ) -> Mean:
+        """One more sample, if `where`."""
+        return Mean(self.total + jnp.where(where, x * weight, 0), self.weight + jnp.where(where, weight, 0.0))
+
+    def result(self) -> Measured:
+        """The mean; invalid without weight."""
+        return measured(safe_divide(self.total, self.weight), self.weight > 0)
+
+
+class Least(NamedTuple):
+    """The least sample so far, and when it came first. For the greatest, give and take the negative."""
+
+    value: Float[Array, "*b"]
+    time: Float[Array, "*b"]  # s
+    found: Bool[Array, "*b"]
+
+    @classmethod
+    def empty(cls, *shape: int) -> Least:
+        """Of no samples."""
+        return cls(jnp.zeros(shape), jnp.zeros(shape), jnp.zeros(shape, bool))
+
+    def add(self, x: Float[Array, "*b"], t: Float[Array, "*b"], where: Bool[Array, "*b"]) -> Least:
+        """One more sample at time `t`, if `where`."""
+        better = where & (~self.found | (x < self.value))
+        return Least(jnp.where(better, x, self.value), jnp.where(better, t, self.time), self.found | where)
+
+    def result(self) -> Measured:
+        """The least; invalid without samples."""
+        return measured(self.value, self.found)
+
+    def when(self) -> Measured:
+        """The time of the least, s."""
+        return measured(self.time, self.found)
+
+
+class Episodes(NamedTuple):
+    """Counts how often a condition began: between `ends` and the next `begins` it goes on.
+
+    Two conditions instead of one give hysteresis: a quantity that trembles at the threshold counts once.
+    """
+
+    number: Int[Array, "*b"]
+    inside: Bool[Array, "*b"]
+
+    @classmethod
+    def empty(cls, *shape: int) -> Episodes:
+        """Nothing has begun."""
+        return cls(jnp.zeros(shape, jnp.int32), jnp.zeros(shape, bool))
+
+    def add(self, begins: Bool[Array, "*b"], ends: Bool[Array, "*b"]) -> Episodes:
+        """One more step. If both hold, it goes on."""
+        return Episodes(
+            self.number + (begins & ~self.inside).astype(jnp.int32), begins | (self.inside & ~ends)
+        )

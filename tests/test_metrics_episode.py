@@ -1,0 +1,469 @@
+"""All metrics of an ego together: episodes with known answers, and what must not matter."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from limsim_jax.metrics.blame import ContactType, Responsibility
+from limsim_jax.metrics.episode import NAMES, EgoMetrics, EgoStep
+from limsim_jax.metrics.reductions import on_host
+from limsim_jax.metrics.safety import NO_GAP, Zones
+
+DT = 0.1
+LENGTH, WIDTH = 5.0, 2.0
+METRICS = EgoMetrics(DT)
+
+PER_VEHICLE = ("box", "velocity", "active", "b_max", "relevant", "changing", "violation")
+FLAGS = (
+    "on_lane",
+    "on_route",
+    "arrived",
+    "off_road",
+    "in_junction",
+    "red_light",
+    "stop_sign",
+    "waits_at_red",
+)
+
+
+def record(steps, ego, others=(), **changes) -> dict[str, Any]:
+    """Vehicles on straight ways, the ego in slot 0: (x, y, heading, v), v a number or one per step."""
+    vehicles = [ego, *others]
+    n = len(vehicles)
+    boxes, velocity, v = np.zeros((steps, n, 5)), np.zeros((steps, n, 2)), np.zeros((steps, n))
+    for k, (x, y, heading, speed) in enumerate(vehicles):
+        v[:, k] = speed
+        way = np.concatenate([[0.0], np.cumsum(v[1:, k] * DT)])
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        boxes[:, k, :2] = np.array([x, y]) + way[:, None] * ahead
+        boxes[:, k, 2:] = heading, LENGTH, WIDTH
+        velocity[:, k] = v[:, k, None] * ahead
+    way = np.concatenate([[0.0], np.cumsum(v[1:, 0] * DT)])
+    r = {
+        "t": 3.0 + np.arange(steps) * DT,  # time need not start at 0
+        "box": boxes,
+        "velocity": velocity,
+        "active": np.ones((steps, n), bool),
+        "b_max": np.full((steps, n), 8.0),
+        "relevant": np.ones((steps, n), bool),
+        "changing": np.zeros((steps, n), bool),
+        "violation": np.zeros((steps, n), bool),
+        "slot": np.zeros(steps, np.int32),
+        "v": v[:, 0],
+        "a": np.concatenate([[0.0], np.diff(v[:, 0]) / DT]),
+        "rear_axle": np.full(steps, 1.4),
+        "lead": np.full(steps, -1, np.int32),
+        "lead_gap": np.full(steps, NO_GAP),
+        "lane_heading": np.full(steps, float(ego[2])),
+        "speed_limit": np.full(steps, 15.0),
+        "to_go": 200.0 - way,
+        "v_others": np.zeros(steps),
+        "others": np.zeros(steps, bool),
+        "zone": np.full((steps, 2), -1, np.int32),
+        "zone_ego": np.zeros((steps, 2), bool),
+        "zone_other": np.zeros((steps, 2), bool),
+    }
+    r |= {name: np.full(steps, name in ("on_lane", "on_route")) for name in FLAGS}
+    unknown = set(changes) - set(r)
+    assert not unknown
+    return r | changes
+
+
+def as_steps(r) -> EgoStep:
+    arrays = {
+        k: jnp.asarray(x, jnp.float32 if np.asarray(x).dtype == np.float64 else None) for k, x in r.items()
+    }
+    zones = Zones(arrays.pop("zone"), arrays.pop("zone_ego"), arrays.pop("zone_other"))
+    return EgoStep(zones=zones, **arrays)
+
+
+TRACES = []
+
+
+@jax.jit
+def one(steps: EgoStep):
+    """Results, and those with a reference progress of 40 m."""
+    TRACES.append(1)
+    carry = METRICS.init(steps.active.shape[1], steps.zones.id.shape[1])
+    carry, _ = jax.lax.scan(lambda c, s: (METRICS.update(c, s), None), carry, steps)
+    return METRICS.result(carry), METRICS.result(carry, jnp.float32(40.0))
+
+
+many = jax.jit(jax.vmap(lambda steps: one(steps)[0]))
+
+STEPS, SLOTS = 81, 4
+
+
+def measure(r, *, reference=False) -> dict[str, Any]:
+    """Short episodes go on without an active ego, among empty slots: one program serves them all."""
+    steps, n = r["active"].shape
+    rest, lacking = STEPS - steps, SLOTS - n
+    r = {k: np.concatenate([x, np.repeat(x[-1:], rest, 0)]) for k, x in r.items()}
+    r["active"][steps:, 0] = False
+    for flag in FLAGS:
+        r[flag][steps:] = flag != "arrived"
+    r["t"][steps:] += DT * np.arange(1, rest + 1)
+    for name in PER_VEHICLE:
+        fill = np.zeros((STEPS, lacking, *r[name].shape[2:]), r[name].dtype)
+        r[name] = np.concatenate([r[name], fill], 1)
+    found = jax.device_get(one(as_steps(r)))[reference]
+    assert all(np.isfinite(x.value) for x in found.values())
+    return on_host(found)
+
+
+def free(steps=61, v: Any = 10.0, **changes):
+    return record(steps, (0, 0, 0, v), **changes)
+
+
+# --- episodes with known answers -----------------------------------------------------------------------
+
+
+def test_a_free_drive():
+    arrived = np.arange(61) == 60
+    found = measure(free(arrived=arrived))
+    assert set(found) == set(NAMES)
+    expected = {
+        "arrived": 1.0, "success": 1.0, "completion": 1.0, "completion_time": 6.0, "duration": 6.0,
+        "mean_speed": 10.0, "contacts": 0.0, "at_fault_contacts": 0.0, "near_misses": 0.0, "ttc_exposed": 0.0,
+        "speeding": 0.0, "overspeed": 0.0, "max_overspeed": 0.0, "off_road": 0.0, "off_route": 0.0,
+        "against_flow": 0.0, "wrong_way": 0.0, "red_lights": 0.0, "stop_signs": 0.0, "max_jerk": 0.0,
+        "rss_longitudinal": 0.0, "rss_lateral": 0.0, "rss_no_response": 0.0, "comfortable": 1.0,
+        "nuplan_no_at_fault_collisions": 1.0, "nuplan_drivable_area": 1.0, "nuplan_driving_direction": 1.0,
+        "nuplan_making_progress": 1.0, "nuplan_ttc": 1.0, "nuplan_speed_limit": 1.0, "nuplan_comfort": 1.0,
+        "carla_score": 100.0, "carla_penalty": 1.0, "limsim_faithful_comfort": 1.0,
+        "limsim_faithful_safety": 1.0, "limsim_corrected_comfort": 1.0, "limsim_corrected_safety": 1.0,
+    }  # fmt: skip
+    for name, value in expected.items():
+        assert found[name] == pytest.approx(value, abs=1e-3), name
+    assert found["distance"] == found["progress"] == pytest.approx(60.0, abs=1e-3)
+    absent = {k for k, x in found.items() if x is None}
+    assert absent == {
+        "min_ttc", "min_ttc_time", "min_ttc_1d", "min_ttc_2d", "min_thw", "max_drac", "max_drac_time",
+        "min_pet", "min_pet_time", "min_distance", "rss_first_time", "contact_time", "contact_other",
+        "contact_type", "contact_at_fault", "contact_responsibility", "contact_delta_v", "max_delta_v",
+        "off_road_time",
+    }  # fmt: skip
+    # without traffic the limit is the reference: 10 of 15 m/s
+    assert found["limsim_faithful_efficiency"] == pytest.approx(10 / 15, rel=1e-4)
+    assert found["limsim_faithful_total"] == pytest.approx(75 + 25 * 10 / 15, rel=1e-4)
+    assert found["nuplan_progress"] == pytest.approx(10 / 15, rel=0.02)
+
+
+def test_not_there_nothing_measured():
+    r = free(30)
+    r["active"][:, 0] = False
+    found = measure(r)
+    assert {k for k, x in found.items() if x is not None} == set()
+
+
+def test_completion_and_progress():
+    found = measure(free(31))  # 3 s
+    assert found["arrived"] == found["success"] == 0.0
+    assert found["progress"] == found["distance"] == pytest.approx(30.0, abs=1e-3)
+    assert found["completion"] == pytest.approx(0.15, abs=1e-5)
+    assert found["completion_time"] is None
+    assert found["duration"] == pytest.approx(3.0)
+    assert found["carla_score"] == pytest.approx(15.0, abs=1e-3)
+    assert found["nuplan_progress"] == pytest.approx(30 / 45, abs=1e-3)  # 3 s at the limit of 15 m/s
+    assert found["limsim_faithful_total"] == pytest.approx(0.15 * found["limsim_faithful_drive"], rel=1e-4)
+    assert found["limsim_faithful_drive"] == pytest.approx(0.6 * (75 + 25 * 10 / 15), rel=1e-4)
+    assert found["limsim_corrected_drive"] == pytest.approx(75 + 25 * 10 / 15, rel=1e-4)
+
+
+def test_a_given_reference_counts_for_nuplan():
+    found = measure(free(31), reference=True)
+    assert found["nuplan_progress"] == pytest.approx(0.75, abs=1e-4)
+    assert found["nuplan_score"] == pytest.approx((5 * 0.75 + 11) / 16, abs=1e-4)
+
+
+def closing(steps=31, **changes):
+    """A leader at 5 m/s, 30 m ahead of the ego at 10 m/s: TTC 6 s at first, 15 m and 3 s at the end."""
+    r = record(steps, (0, 0, 0, 10.0), [(35, 0, 0, 5.0)])
+    gap = 30.0 - 5.0 * DT * np.arange(steps)
+    return r | {"lead": np.ones(steps, np.int32), "lead_gap": gap} | changes
+
+
+def test_a_leader_that_comes_nearer():
+    found = measure(closing())
+    assert found["min_ttc"] == found["min_ttc_1d"] == pytest.approx(3.0, abs=1e-4)
+    assert found["min_ttc_2d"] == pytest.approx(3.0, abs=1e-4)
+    assert found["min_ttc_time"] == pytest.approx(6.0)  # 3 s after the start at 3 s
+    assert found["min_thw"] == pytest.approx(1.5, abs=1e-4)
+    assert found["max_drac"] == pytest.approx(25 / 30, rel=1e-4)
+    assert found["max_drac_time"] == pytest.approx(6.0)
+    assert found["min_distance"] == pytest.approx(15.0, abs=1e-4)
+    # RSS: 10 * 0.5 + 0.25 + 11^2 / 8 - 25 / 16 = 18.8125 m, from the step at 2.3 s on: 8 of 30
+    assert found["rss_longitudinal"] == pytest.approx(8 / 30, abs=1e-5)
+    assert found["rss_first_time"] == pytest.approx(5.3, abs=1e-4)
+    # half a second to respond: not braking from the sixth step on
+    assert found["rss_no_response"] == pytest.approx(3 / 30, abs=1e-5)
+    braking = np.where(np.arange(31) > 27, -4.0, 0.0)
+    assert measure(closing(a=braking))["rss_no_response"] == 0.0
+    # the TTC is below 3 s from 3.1 s on
+    assert measure(closing(41))["ttc_exposed"] == pytest.approx(10 * DT, abs=1e-4)
+
+
+def test_who_is_not_relevant_or_not_there_is_not_met():
+    r = closing(lead=np.full(31, -1, np.int32))
+    r["relevant"][:, 1] = False
+    found = measure(r)
+    assert found["min_ttc"] is None and found["nuplan_ttc"] == 1.0
+    assert found["min_distance"] == pytest.approx(15.0, abs=1e-4)  # a distance it is
+    r = closing()
+    r["active"][:, 1] = False
+    found = measure(r)
+    assert found["min_ttc"] is found["min_thw"] is found["min_distance"] is None
+
+
+def test_near_misses_are_episodes():
+    """A crossing car, twice a short TTC in between a longer one; the second time it trembles."""
+    v = np.full(61, 10.0)
+    ttc = np.concatenate(
+        [np.linspace(5, 1.2, 15), np.linspace(1.4, 4, 15), [1.45, 1.6, 1.4, 1.9, 1.3] * 6, [4.0]]
+    )
+    r = record(61, (0, 0, 0, v), [(0, 0, 0, 0.0)])
+    r["box"][:, 1, 0] = r["box"][:, 0, 0] + ttc * 10 + LENGTH
+    found = measure(r)
+    assert found["near_misses"] == 2.0
+    assert found["min_ttc"] == pytest.approx(1.2, abs=1e-3)
+    assert found["min_ttc_1d"] is None
+    assert found["nuplan_ttc"] == 1.0
+    # a contact is no near miss; by the ego's fault it is a TTC of 0 to nuPlan
+    r["box"][55, 1, 0] = r["box"][55, 0, 0] + LENGTH - 0.1
+    found = measure(r)
+    assert (found["near_misses"], found["contacts"], found["nuplan_ttc"]) == (1.0, 1.0, 0.0)
+
+
+def test_a_contact():
+    r = closing(81)
+    r["lead_gap"] = np.maximum(r["lead_gap"], 0.0)
+    found = measure(r)
+    expected = {
+        "contacts": 1.0, "at_fault_contacts": 1.0, "contact_time": 9.0, "contact_other": 1.0,
+        "contact_type": ContactType.FRONT, "contact_at_fault": 1.0, "contact_delta_v": 2.5,
+        "contact_responsibility": Responsibility.EGO, "max_delta_v": 2.5, "near_misses": 0.0, "min_ttc": 0.0,
+        "success": 0.0, "nuplan_no_at_fault_collisions": 0.0, "nuplan_score": 0.0, "nuplan_ttc": 0.0,
+        "carla_penalty": 0.6, "ttc_exposed": 3.0,
+    }  # fmt: skip
+    for name, value in expected.items():
+        assert found[name] == pytest.approx(float(value), abs=1e-3), name
+    parts = ("comfort", "efficiency", "safety")
+    for version in ("faithful", "corrected"):
+        c, e, s = (found[f"limsim_{version}_{part}"] for part in parts)
+        assert found[f"limsim_{version}_drive"] == pytest.approx(60 * (c / 4 + e / 4 + s / 2), rel=1e-4)
+
+
+def test_a_contact_by_somebody_elses_fault():
+    r = record(61, (0, 0, 0, 5.0), [(-20, 0, 0, 12.0)], arrived=np.arange(61) == 60)
+    found = measure(r)
+    assert (found["contacts"], found["at_fault_contacts"], found["success"]) == (1.0, 0.0, 0.0)
+    assert Responsibility(int(found["contact_responsibility"])) == Responsibility.OTHER
+    assert found["nuplan_no_at_fault_collisions"] == found["nuplan_ttc"] == 1.0  # it comes from behind
+    assert found["nuplan_score"] > 0.7
+    assert found["carla_penalty"] == pytest.approx(0.6)  # CARLA does not ask
+    assert found["limsim_faithful_drive"] < 0.7 * found["limsim_corrected_drive"]
+
+
+@pytest.mark.parametrize(
+    ("y", "changing", "junction", "kept"),
+    [
+        (0.0, False, False, 0.0),
+        (-12.0, False, False, 1.0),
+        (-12.0, True, False, 0.0),
+        (-12.0, False, True, 0.0),
+    ],
+)
+def test_nuplans_ttc_looks_ahead_and_in_junctions_aside(y, changing, junction, kept):
+    """A car that comes from the right, 72 degrees off the heading, or stands ahead; ever 0.6 s away."""
+    steps = 31
+    if y:
+        r = record(steps, (0, 0, 0, 10.0), [(2.5, y, np.pi / 2, 0.0)])
+        r["box"][:, 1, :2] = r["box"][:, 0, :2] + np.array([2.5, y])
+        r["velocity"][:, 1] = [10.0, 14.0]  # 8.5 m to the ego's side
+    else:
+        r = record(steps, (0, 0, 0, 10.0), [(11.0, 0, 0, 0.0)])
+        r["box"][:, 1, 0] = r["box"][:, 0, 0] + 11.0
+    r["changing"][:, 0] = changing
+    r["in_junction"] = np.full(steps, junction)
+    found = measure(r)
+    assert found["min_ttc"] == pytest.approx(8.5 / 14 if y else 0.6, rel=1e-3)
+    assert found["nuplan_ttc"] == kept
+
+
+def test_speeding():
+    v = np.where((np.arange(61) >= 20) & (np.arange(61) < 35), 17.0, 14.0)
+    found = measure(free(v=v, on_lane=np.arange(61) != 30))
+    assert found["speeding"] == pytest.approx(14 / 60, abs=1e-4)  # off the lanes there is no limit
+    assert found["max_overspeed"] == pytest.approx(2.0)
+    assert found["overspeed"] == pytest.approx(2.0 * 14 * DT, rel=1e-4)
+    assert found["nuplan_speed_limit"] == pytest.approx(1 - 2.8 / (2.23 * 6), rel=1e-4)
+
+
+def test_off_the_road_and_off_the_route():
+    steps = np.arange(61)
+    off, on_route = (steps >= 20) & (steps < 26), (steps < 40) | (steps >= 50)
+    found = measure(free(off_road=off, on_route=on_route, arrived=steps == 60))
+    assert found["arrived"] == 1.0
+    assert found["off_road"] == pytest.approx(0.1, abs=1e-5)
+    assert found["off_road_time"] == pytest.approx(5.0)
+    assert found["off_route"] == pytest.approx(16 / 60, rel=1e-4)
+    assert found["nuplan_drivable_area"] == found["nuplan_score"] == found["success"] == 0.0
+    assert found["carla_penalty"] == pytest.approx(1 - 16 / 60, rel=1e-4)
+    assert found["limsim_corrected_drive"] == pytest.approx(0.6 * (75 + 25 * 10 / 15), rel=1e-4)
+
+
+def test_against_the_flow():
+    heading = np.where((np.arange(61) >= 20) & (np.arange(61) < 24), np.pi, 0.0)  # four steps of 1 m
+    found = measure(free(lane_heading=heading))
+    assert found["wrong_way"] == pytest.approx(4 / 60, abs=1e-5)
+    assert found["against_flow"] == 0.0  # within a second it drives more with the flow
+    heading = np.where((np.arange(61) >= 20) & (np.arange(61) < 27), np.pi, 0.0)
+    assert measure(free(lane_heading=heading))["against_flow"] == pytest.approx(3.0, abs=1e-3)  # 7 of 11
+    assert measure(free(lane_heading=heading))["nuplan_driving_direction"] == 0.5
+    heading = np.full(61, np.pi)
+    found = measure(free(lane_heading=heading))
+    assert found["against_flow"] == pytest.approx(11.0, abs=1e-3)
+    assert (found["wrong_way"], found["nuplan_driving_direction"]) == (1.0, 0.0)
+    # without a lane there is no direction
+    assert measure(free(lane_heading=heading, on_lane=np.zeros(61, bool)))["against_flow"] == 0.0
+
+
+def test_signals_and_signs():
+    steps = np.arange(61)
+    found = measure(free(red_light=(steps == 12) | (steps == 40), stop_sign=steps == 33))
+    assert (found["red_lights"], found["stop_signs"]) == (2.0, 1.0)
+    assert found["carla_penalty"] == pytest.approx(0.49 * 0.8)
+
+
+def test_too_near_beside():
+    """0.5 m apart, then 0.12 m; RSS asks for 0.1 + 2 * 0.03125 m of two that keep their lanes."""
+    r = record(61, (0, 0, 0, 10.0), [(1.0, 2.5, 0, 10.0)])
+    r["box"][41:, 1, 1] = 2.12
+    found = measure(r)
+    assert found["rss_lateral"] == pytest.approx(20 / 60, abs=1e-5)
+    assert found["rss_first_time"] == pytest.approx(7.1, abs=1e-4)
+    r["velocity"][:, 1, 1] = -0.8  # it comes nearer: 0.425 + 0.506 m more
+    assert measure(r)["rss_lateral"] == 1.0
+    r["box"][:, 1, 2] = np.pi  # oncoming traffic is judged by its own rules
+    assert measure(r)["rss_lateral"] == 0.0
+
+
+def test_pet_comes_from_the_zones():
+    steps = np.arange(61)
+    zone = np.tile(np.array([5, -1], np.int32), (61, 1))
+    ego, other = np.zeros((61, 2), bool), np.zeros((61, 2), bool)
+    ego[10:15, 0] = True
+    other[(steps >= 27) & (steps < 30), 0] = True
+    found = measure(free(zone=zone, zone_ego=ego, zone_other=other))
+    assert found["min_pet"] == pytest.approx(1.2, abs=1e-4)
+    assert found["min_pet_time"] == pytest.approx(5.7, abs=1e-4)
+
+
+def test_an_ego_that_left_is_not_followed_by_another():
+    """Its slot is taken by a car that drives against the flow into a wall."""
+    r = free(61, arrived=np.arange(61) == 30)
+    first = measure({k: x.copy() for k, x in r.items()})
+    r["active"][30, 0] = False  # as in the engine: it is gone in the step in which it arrives
+    r["v"][31:] = 30.0
+    r["a"][31:] = -9.0
+    r["lane_heading"][31:] = np.pi
+    r["off_road"] = np.arange(61) > 30
+    found = measure(r)
+    assert first["completion_time"] == found["completion_time"] == pytest.approx(3.0)
+    assert found["success"] == found["completion"] == 1.0
+    assert found["wrong_way"] == found["off_road"] == found["max_overspeed"] == 0.0
+    assert found["min_acceleration"] == pytest.approx(0.0, abs=1e-4)
+
+
+# --- what must not matter ------------------------------------------------------------------------------
+
+
+def random_record(seed, n=9, steps=40):
+    rng = np.random.default_rng(seed)
+    others = [
+        (*rng.uniform(-25, 25, 2), rng.uniform(-np.pi, np.pi), np.abs(rng.normal(8, 5))) for _ in range(n - 1)
+    ]
+    v = np.clip(10 + np.cumsum(rng.normal(size=steps)) * 0.3, 0, 16)
+    r = record(steps, (0, 0, 0.4, v), others)
+    r["active"][:, 1:] = rng.random((steps, n - 1)) < 0.97
+    r["changing"][:] = rng.random((steps, n)) < 0.2
+    r["violation"][:] = rng.random((steps, n)) < 0.1
+    r["b_max"][:] = rng.uniform(5, 9, n)
+    r["relevant"][:] = rng.random((steps, n)) < 0.8
+    r["box"][:, :, 3] = rng.uniform(4, 9, n)
+    lead = rng.integers(1, n, steps // 10).repeat(10)
+    r["lead"], r["lead_gap"] = lead.astype(np.int32), rng.uniform(2, 40, steps)
+    r["zone"] = np.tile(np.array([4, 9], np.int32), (steps, 1))
+    r["zone_ego"], r["zone_other"] = rng.random((2, steps, 2)) < 0.2
+    r["v_others"], r["others"] = rng.uniform(4, 16, steps), rng.random(steps) < 0.5
+    for name in ("off_road", "red_light", "waits_at_red", "in_junction"):
+        r[name] = rng.random(steps) < 0.1
+    return r
+
+
+def with_empty_slots(r, number=3):
+    """The same record with slots at the end that hold NaN."""
+    out = dict(r)
+    for name in PER_VEHICLE:
+        fill = np.full_like(r[name][:, :number], np.nan if r[name].dtype == float else 1)
+        out[name] = np.concatenate([r[name], fill], 1)
+    out["active"][:, -number:] = False
+    out["b_max"][:, -number:] = 0.0
+    return out
+
+
+def shuffled(r, order):
+    """The same record with vehicles (and zones) in other slots."""
+    out = {k: x[:, order] if k in PER_VEHICLE else x for k, x in r.items()}
+    place = np.argsort(order)
+    out["slot"] = place[r["slot"]].astype(np.int32)
+    out["lead"] = np.where(r["lead"] < 0, -1, place[r["lead"]]).astype(np.int32)
+    return out | {k: r[k][:, ::-1] for k in ("zone", "zone_ego", "zone_other")}
+
+
+def stack(records):
+    return jax.tree.map(lambda *x: jnp.stack(x), *map(as_steps, records))
+
+
+def assert_same(a, b):
+    assert set(a) == set(b)
+    for name in a:
+        x, y = (np.asarray(value, float) for value in (a[name], b[name]))
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5, err_msg=name)
+
+
+def test_slots_do_not_matter():
+    """Neither their order nor empty ones."""
+    rng = np.random.default_rng(0)
+    records = [with_empty_slots(random_record(seed)) for seed in range(12)]
+    orders = [rng.permutation(12) for _ in records]
+    a = on_host(many(stack(records)))
+    b = on_host(many(stack([shuffled(r, order) for r, order in zip(records, orders, strict=True)])))
+    others = a.pop("contact_other"), b.pop("contact_other")
+    assert_same(a, b)
+    for k, order in enumerate(orders):
+        if not np.isnan(others[0][k]):
+            assert np.argsort(order)[int(others[0][k])] == int(others[1][k])
+    assert np.sum(~np.isnan(others[0])) > 3  # there are contacts
+    assert np.nanmin(a["min_pet"]) < 1 and np.nanmax(a["contacts"]) > 1
+    empty = shuffled(records[4], np.array([*range(9, 12), *range(9)]))
+    alone = random_record(4)
+    assert_same(
+        on_host(one(as_steps(alone))[0]) | {"contact_other": 0},
+        on_host(one(as_steps(empty))[0]) | {"contact_other": 0},
+    )
+
+
+def test_the_size_of_the_batch_does_not_matter():
+    records = [with_empty_slots(random_record(seed)) for seed in range(12)]
+    batch = on_host(many(stack(records)))
+    pair = on_host(many(stack([records[7], records[0]])))
+    assert_same(pair, {name: value[[7, 0]] for name, value in batch.items()})
+    traces = len(TRACES)
+    again = on_host(many(stack([records[0], records[7]])))
+    assert_same(again, {name: value[[0, 7]] for name, value in batch.items()})
+    assert len(TRACES) == traces  # other worlds of the same shape are the same program
+    assert_same(on_host(one(as_steps(records[7]))[0]), {name: value[7] for name, value in batch.items()})

@@ -1,0 +1,166 @@
+"""Comfort metrics against SciPy on the whole record, and episodes with known answers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import signal
+
+from limsim_jax.metrics.motion import (
+    COMFORT,
+    filter_init,
+    filter_result,
+    filter_update,
+    filters,
+    motion_init,
+    motion_result,
+    motion_update,
+)
+from limsim_jax.metrics.reductions import on_host
+
+DT = 0.1
+
+
+def savgol(x, window, order, **options) -> np.ndarray:
+    return np.asarray(signal.savgol_filter(x, window, order, **options))
+
+
+def whole_record(v, a, heading):
+    """nuPlan's quantities by SciPy: the second sample is the first with an acceleration."""
+    turn = np.diff(np.unwrap(heading))
+    along, across = a[1:], v[1:] * turn / DT
+    smooth = {
+        "acceleration": savgol(along, 8, 2),
+        "lateral_acceleration": savgol(across, 8, 2),
+    }
+    magnitude = savgol(np.hypot(along, across), 8, 2)
+    return smooth | {
+        "jerk": savgol(magnitude, 15, 2, deriv=1, delta=DT),
+        "longitudinal_jerk": savgol(smooth["acceleration"], 15, 2, deriv=1, delta=DT),
+        "yaw_rate": savgol(np.unwrap(heading), 5, 2, deriv=1, delta=DT),
+        "yaw_acceleration": savgol(np.unwrap(heading), 5, 3, deriv=2, delta=DT),
+    }
+
+
+@jax.jit
+def streamed(v, a, heading):
+    def step(carry, x):
+        t, v, a, heading = x
+        return motion_update(DT, carry, t=t, v=v, a=a, heading=heading)[0], None
+
+    t = jnp.arange(v.shape[0], dtype=v.dtype) * DT
+    carry, _ = jax.lax.scan(step, motion_init(DT), (t, v, a, heading))
+    return motion_result(DT, carry)
+
+
+def measure(v, a, heading):
+    return on_host(streamed(*(jnp.asarray(x, jnp.float32) for x in (v, a, heading))))
+
+
+@pytest.mark.parametrize("n", [23, 24, 60])
+@pytest.mark.parametrize("name", ["acceleration", "jerk", "yaw_rate", "yaw_acceleration"])
+def test_a_stream_gives_what_scipy_gives_on_the_whole_record(name, n):
+    kept = getattr(filters(DT), name)
+    rng = np.random.default_rng(n)
+    x = rng.normal(size=(n, 2)) + 3.0
+
+    def step(carry, row):
+        carry, y, new = filter_update(kept, carry, row, jnp.ones((), bool))
+        return carry, (y, new)
+
+    carry, (y, new) = jax.lax.scan(step, filter_init(kept, 2), jnp.asarray(x, jnp.float32))
+    rest, valid = filter_result(kept, carry)
+    assert valid.all()
+    found = np.concatenate([np.asarray(y)[np.asarray(new)], rest])
+    smooth = savgol(x, 8, 2, axis=0)
+    expected = {
+        "acceleration": smooth,
+        "jerk": savgol(smooth, 15, 2, deriv=1, delta=DT, axis=0),
+        "yaw_rate": savgol(x, 5, 2, deriv=1, delta=DT, axis=0),
+        "yaw_acceleration": savgol(x, 5, 3, deriv=2, delta=DT, axis=0),
+    }[name]
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_extremes_are_those_of_the_whole_record():
+    rng = np.random.default_rng(1)
+    n = 80
+    a = rng.normal(size=n) * 2 - 0.5  # unequal extremes on both sides
+    v = 12 + rng.normal(size=n)
+    heading = 3.0 + np.cumsum(rng.normal(size=n) * 0.02 + 0.02)  # across pi
+    heading = (heading + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(np.diff(heading)).max() > 6  # it does wrap
+    expected, found = whole_record(v, a, heading), measure(v, a, heading)
+    assert found["min_acceleration"] == pytest.approx(expected["acceleration"].min(), abs=1e-4)
+    assert found["max_acceleration"] == pytest.approx(expected["acceleration"].max(), abs=1e-4)
+    for name in list(COMFORT)[1:]:
+        assert found[f"max_{name}"] == pytest.approx(np.abs(expected[name]).max(), rel=2e-4), name
+    for name, key in (("acceleration", "acceleration"), ("jerk", "longitudinal_jerk")):
+        assert found[f"rms_{name}"] == pytest.approx(np.sqrt(np.mean(expected[key] ** 2)), rel=1e-4)
+
+
+def test_steady_braking_and_a_circle():
+    n = 40
+    found = measure(np.linspace(20, 8, n), np.full(n, -3.0), np.zeros(n))
+    assert found["min_acceleration"] == pytest.approx(-3.0, abs=1e-4)
+    assert found["max_acceleration"] == pytest.approx(-3.0, abs=1e-4)
+    assert found["max_longitudinal_jerk"] == pytest.approx(0.0, abs=1e-3)
+    assert found["comfortable"] == 1.0
+    # radius 25 m at 10 m/s: 4 m/s^2 to the right, 0.4 rad/s
+    found = measure(np.full(n, 10.0), np.zeros(n), 2.0 - 0.4 * DT * np.arange(n))
+    assert found["max_lateral_acceleration"] == pytest.approx(4.0, abs=1e-3)
+    assert found["max_yaw_rate"] == pytest.approx(0.4, abs=1e-4)
+    assert found["max_yaw_acceleration"] == pytest.approx(0.0, abs=2e-3)
+    assert found["rms_acceleration"] == pytest.approx(0.0, abs=1e-4)
+    assert found["comfortable"] == 1.0
+
+
+def test_a_ramp_of_acceleration_has_its_slope_as_jerk():
+    n = 300
+    v, a, heading = np.full(n, 10.0), -2.0 * DT * np.arange(n), np.zeros(n)
+    found = measure(v, a, heading)
+    assert found["rms_jerk"] == pytest.approx(2.0, rel=2e-3)
+    # nuPlan's even window shifts the middle against the ends: too high there by an eighth
+    assert np.abs(whole_record(v, a, heading)["longitudinal_jerk"]).max() == pytest.approx(2.2528, rel=1e-4)
+    assert found["max_longitudinal_jerk"] == pytest.approx(2.2528, rel=1e-3)
+    assert found["max_jerk"] == pytest.approx(2.2528, rel=1e-3)
+    assert found["min_acceleration"] == pytest.approx(-2.0 * DT * (n - 1), rel=1e-3)
+
+
+def test_the_acceleration_before_the_start_does_not_count():
+    n = 40
+    a = np.zeros(n)
+    a[0] = -9.0
+    assert measure(np.full(n, 10.0), a, np.zeros(n))["min_acceleration"] == pytest.approx(0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("a", "heading", "comfortable"),
+    [(2.39, 0.0, True), (2.41, 0.0, False), (-4.04, 0.0, True), (-4.06, 0.0, False),
+     (0.0, 0.94, True), (0.0, -0.96, False)],
+)  # fmt: skip
+def test_comfort_has_nuplans_bounds(a, heading, comfortable):
+    n = 40
+    found = measure(np.full(n, 2.0), np.full(n, a), heading * DT * np.arange(n))
+    assert found["comfortable"] == float(comfortable)
+
+
+def test_a_short_record_has_no_value_and_no_nan():
+    n = 22  # acceleration and yaw are known; jerk needs 23 accelerations
+    raw = streamed(*(jnp.ones(n) for _ in range(3)))
+    found = on_host(raw)
+    assert found["max_jerk"] is None
+    assert found["comfortable"] is None
+    assert found["max_acceleration"] == pytest.approx(1.0, abs=1e-5)
+    assert all(bool(jnp.isfinite(x.value).all()) for x in raw.values())
+    assert on_host(streamed(*(jnp.ones(1) for _ in range(3))))["max_yaw_rate"] is None
+
+
+def test_windows_keep_their_length_in_seconds():
+    assert filters(0.05).yaw_rate.window == 2 * filters(0.1).yaw_rate.window + 1  # even windows look further
+    n, dt = 60, 0.05
+    x = np.sin(np.arange(n) * dt)
+    kept = filters(dt).yaw_rate
+    h = kept.head.shape[0] - 1
+    middle = kept.head[-1] @ x[: kept.window]
+    assert middle == pytest.approx(savgol(x, 10, 2, deriv=1, delta=dt)[h], abs=1e-9)

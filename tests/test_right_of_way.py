@@ -1,0 +1,237 @@
+"""Who goes first where paths meet: lights, signs, priority, gaps."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from traffic_worlds import bundled, drivers, state_of
+
+from limsim_jax.maps.lane_map import LaneMap, build_lane_map, lane_rows
+from limsim_jax.maps.network import Control
+from limsim_jax.maps.signals import SignalState, phase_at
+from limsim_jax.traffic import right_of_way
+from limsim_jax.traffic.engine import Traffic, drive
+from limsim_jax.traffic.motion import boxes
+from limsim_jax.traffic.right_of_way import Rows, travel_time
+from limsim_jax.traffic.signals import DETECTOR, GAP, switch
+from limsim_jax.types import Config, Lights
+
+CONFIG = Config(dt=0.1)
+
+
+def test_travel_time_is_that_of_the_motion():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        distance, v, more, a = rng.uniform([0.1, 0, 0.1, 0.3], [80, 20, 10, 3])
+        v_end = v + more
+        arrives = lambda t, y: y[0] - distance  # noqa: B023, E731
+        arrives.terminal = True
+        motion = solve_ivp(
+            lambda t, y: [y[1], a if y[1] < v_end else 0.0],  # noqa: B023
+            (0, 500), [0, v], events=arrives, max_step=0.02,
+        )  # fmt: skip
+        found = float(travel_time(*(jnp.float32(x) for x in (distance, v, v_end, a))))
+        assert found == pytest.approx(motion.t[-1], rel=5e-3, abs=0.02)
+    assert float(travel_time(jnp.float32(-3), jnp.float32(5), jnp.float32(5), jnp.float32(1))) == 0
+
+
+def random_sights(n, seed):
+    """Vehicles in all situations: before, on and behind the stretch, waiting, kept, under lights."""
+    rng = np.random.default_rng(seed)
+    v = rng.choice([0.0, 0.5, 4.0, 12.0], n) * rng.uniform(0.5, 1, n)
+    slow = rng.uniform(3, 14, n)
+    values = {
+        "y": rng.uniform(-40, 25, n), "length": rng.uniform(3, 12, n), "v": v, "slow": slow,
+        "fast": np.maximum(v, slow), "a": rng.uniform(0.8, 2.5, n), "brake": v * v / 8,
+        "wait": rng.choice([0.0, 2.0, 10.0, 40.0], n), "line": rng.uniform(-20, 40, n),
+        "stuck": rng.integers(0, 2, n) * 1.0, "held": rng.integers(0, 2, n) * 1.0,
+        "major": rng.choice([-1.0, 0.0, 1.0, 2.0], n), "slot": np.arange(n) * 1.0 + 1000 * seed,
+    }  # fmt: skip
+    return right_of_way._Sight(**{name: jnp.asarray(x, jnp.float32) for name, x in values.items()})
+
+
+@pytest.mark.parametrize("merges", [False, True])
+def test_of_two_vehicles_exactly_one_goes_first(merges):
+    n = 20000
+    rng = np.random.default_rng(7)
+    me, foe = random_sights(n, 1), random_sights(n, 2)
+    start, length = rng.uniform(0, 15, (2, n)), rng.uniform(1, 12, (2, n))
+    mine, theirs = (
+        right_of_way._Way(jnp.asarray(start[i], jnp.float32), jnp.asarray(start[i] + length[i], jnp.float32))
+        for i in range(2)
+    )
+    gap = jnp.asarray(rng.uniform(0.5, 2, (2, n)), jnp.float32)
+    prio, tie = (jnp.asarray(rng.integers(-1, 2, n), jnp.int32) for _ in range(2))
+    kind = jnp.full(n, merges)
+    one = right_of_way._goes_first(me, mine, gap[0], foe, theirs, gap[1], prio, tie, kind)
+    other = right_of_way._goes_first(foe, theirs, gap[1], me, mine, gap[0], -prio, -tie, kind)
+    np.testing.assert_array_equal(np.asarray(one), ~np.asarray(other))
+    assert 0.3 < np.asarray(one).mean() < 0.7
+    # who is on the stretch goes before who is not
+    on, off = np.asarray(mine.start - me.y) <= 0, np.asarray(theirs.start - foe.y) > np.asarray(foe.brake)
+    assert np.asarray(one)[on & off].all() and (on & off).sum() > 100
+
+
+def rows_of(line, n):
+    one = lambda x, dtype: jnp.asarray(np.stack([x, np.full(n, -1)], -1), dtype)  # noqa: E731
+    zero = np.zeros(n)
+    return Rows(
+        one(zero, jnp.int32), one(zero, jnp.int32), one(-line - 1, jnp.float32), one(line, jnp.float32)
+    )
+
+
+def test_yellow_is_a_dilemma_that_the_braking_decides():
+    """Stop at yellow if 3 m/s^2 are enough; who would have to brake harder drives on."""
+    n = 300
+    rng = np.random.default_rng(0)
+    v, line = rng.uniform(3, 16, n), rng.uniform(1, 60, n)
+    state = state_of("highway", [0] * n, [0.0] * n, v, [0] * n)
+    rows = rows_of(line, n)
+    speed = jnp.full((n, 2), 20.0)  # straight on
+
+    def stops(light):
+        where, _ = right_of_way._lights(state, rows, speed, jnp.full(4, int(light)))
+        return np.asarray(where)[:, 0] < 1e5
+
+    late = 2 * line > 2.5 * (v + 20)
+    needed = v * v / (2 * line)
+    np.testing.assert_array_equal(stops(SignalState.YELLOW), needed <= np.where(late, 4.5, 3.0))
+    np.testing.assert_array_equal(stops(SignalState.RED), needed <= 0.9 * 8)
+    assert not stops(SignalState.GREEN_MAJOR).any() and not stops(SignalState.OFF).any()
+    assert stops(SignalState.RED_YELLOW)[v < 4].any()
+
+
+def test_fixed_programs_follow_the_clock():
+    _, lane_map = bundled("intersection")
+    state = state_of("intersection", [0], [5.0], [5.0], [0])
+    nobody = jnp.full((1, 1), -1)
+    for step in (0, 100, 345, 1111):
+        lights = switch(
+            CONFIG, lane_map, dataclasses.replace(state, step=jnp.int32(step)), nobody, 0.0 * nobody
+        )
+        np.testing.assert_array_equal(lights.phase, phase_at(lane_map.signals, step * 0.1))
+
+
+def test_actuated_green_lasts_while_vehicles_come():
+    _, lane_map = bundled("intersection")
+    signals = dataclasses.replace(
+        lane_map.signals,
+        actuated=jnp.ones_like(lane_map.signals.actuated),
+        min_duration=lane_map.signals.duration.at[0, 0].set(5.0),
+        max_duration=lane_map.signals.duration.at[0, 0].set(30.0),
+    )
+    lane_map = dataclasses.replace(lane_map, signals=signals)
+    green = np.asarray(signals.state[0, 0])[np.asarray(signals.lane_link)] >= int(SignalState.GREEN_MINOR)
+    green &= np.asarray(signals.lane_program) == 0
+    lane = jnp.asarray([[int(np.nonzero(green)[0][0])]])
+
+    def length(seen_until):
+        """s of the first phase with somebody at the detector up to then."""
+        state = state_of("intersection", [0], [5.0], [5.0], [0])
+        for k in range(200):
+            here = jnp.full((1, 1), 10.0 if k * 0.5 <= seen_until else DETECTOR + 1)
+            lights: Lights = jitted(dataclasses.replace(state, step=jnp.int32(5 * k)), lane, here)
+            if int(lights.phase[0]) != 0:
+                return 0.5 * k
+            state = dataclasses.replace(state, lights=lights)
+        raise AssertionError("the phase never ends")
+
+    jitted = jax.jit(functools.partial(switch, CONFIG, lane_map))
+    assert length(-1) == pytest.approx(5.0, abs=0.51)  # nobody: the least
+    assert length(12.0) == pytest.approx(12.0 + GAP, abs=1.01)
+    assert length(1e9) == pytest.approx(30.0, abs=0.51)  # always somebody: the most
+
+
+@functools.cache
+def without_lights() -> tuple[LaneMap, dict[str, int]]:
+    """The bundled intersection with its lights out: right before left."""
+    network, _ = bundled("intersection")
+    movements = tuple(
+        dataclasses.replace(m, control=Control.NONE, program=None, link=None) for m in network.movements
+    )
+    network = dataclasses.replace(network, movements=movements, programs={})
+    return build_lane_map(network), lane_rows(network)
+
+
+@functools.cache
+def runner(lights: bool, decisions: int):
+    lane_map = bundled("intersection")[1] if lights else without_lights()[0]
+
+    @jax.jit
+    def run(state):
+        def record(tick):
+            return tick.state.lane, tick.state.s, tick.state.v, boxes(lane_map, tick.state), tick.left
+
+        def decision(state, _):
+            return drive(CONFIG, Traffic(lane_changes=False), lane_map, state, record=record)
+
+        end, records = jax.lax.scan(decision, state, None, length=decisions)
+        return end, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
+
+    return run
+
+
+def straight_on(lane_map):
+    """For every goal: the lane before the junction from which it lies straight ahead, and the goal."""
+    bend, connector = np.asarray(lane_map.curvature_max), np.asarray(lane_map.is_connector)
+    after, before = np.asarray(lane_map.routes.next_lane), np.asarray(lane_map.predecessors)[:, 0]
+    found = {}
+    for lane in np.nonzero(connector)[0]:
+        for goal in np.nonzero(after[before[lane]] == lane)[0]:
+            if goal not in found or bend[lane] < bend[found[goal]]:
+                found[int(goal)] = lane
+    return [(int(before[lane]), goal) for goal, lane in found.items()]
+
+
+def test_four_who_arrive_together_all_get_across():
+    """Right before left is a circle of four: somebody has to begin, and all are through in 20 s."""
+    lane_map, _ = without_lights()
+    ways = straight_on(lane_map)
+    assert len(ways) == 4
+    lanes, goals = zip(*ways, strict=True)
+    s = [float(lane_map.length[lane]) - 30.0 for lane in lanes]
+    state = state_of("intersection", lanes, s, [9.0] * 4, goals, driver=drivers(4))
+    end, (lane, _, v, box, _) = runner(False, 44)(state)
+    inside = np.asarray(lane_map.is_connector)[np.asarray(lane)]
+    assert inside.any(0).all(), "everybody enters"
+    gone = ~inside[-1] & inside.any(0)
+    assert gone.all(), "and is through"
+    assert int(np.asarray(end.status).max()) == 0
+    assert (np.asarray(v) < 0.5).any(), "somebody had to wait"
+    assert np.isfinite(np.asarray(box)).all()
+
+
+def test_red_lights_are_obeyed_and_green_discharges_the_queue():
+    """A queue before a red light waits behind the line and then leaves as car following has it."""
+    _, lane_map = bundled("intersection")
+    shown = np.asarray(lane_map.signals.lane_program) >= 0
+    ways = [
+        (lane, goal)
+        for lane, goal in straight_on(lane_map)
+        if shown[int(lane_map.routes.next_lane[lane, goal])]
+    ]
+    lane, goal = ways[0]
+    length, stop = float(lane_map.length[lane]), float(lane_map.stop_s[lane])
+    before = int(lane_map.predecessors[lane, 0])
+    n = 8
+    front = [stop - 2.0 - 7.0 * i for i in range(n)]
+    rows = [lane if s > 6 else before for s in front]
+    front = [s if s > 6 else s + float(lane_map.length[before]) for s in front]
+    state = state_of(
+        "intersection", rows, front, [0.0] * n, [goal] * n, driver=drivers(n, T=1.2, a=1.5, b=2.0)
+    )
+    end, (at, s, v, _, _) = runner(True, 240)(state)
+    at, s, v = np.asarray(at), np.asarray(s), np.asarray(v)
+    assert not (np.asarray(end.status) & 8).any(), "nobody runs the red light"
+    crossed = np.asarray(lane_map.is_connector)[at]
+    times = np.array([np.argmax(crossed[:, i]) for i in range(n)]) * 0.1
+    assert crossed.any(0).all() and (np.diff(times) > 0).all()
+    # algorithms: IDM with (T, a, b) = (1.2, 1.5, 2.0) discharges 1655 veh/h, the triangular bound is 1775
+    headway = np.diff(times)[3:]
+    headway = headway[headway < 10]
+    assert 3600 / headway.mean() == pytest.approx(1700, rel=0.12)
+    assert s[at == lane].max() <= length + 0.01
