@@ -1,4 +1,4 @@
-"""How fast maps load and how fast lanes are looked up, on this machine.
+"""How fast maps load, lanes are looked up and traffic runs, on this machine.
 
 Everything is timed in processes of its own: a cold start is then really cold, and on one core even the
 threads of XLA have only that core.
@@ -9,18 +9,35 @@ from __future__ import annotations
 import json
 import os
 import platform
+import random
 import resource
+import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from limsim_jax import __version__
 from limsim_jax.maps.network import MapError
+
+if TYPE_CHECKING:
+    from limsim_jax.maps.lane_map import LaneMap
+    from limsim_jax.maps.network import Network
+    from limsim_jax.traffic.demand import Demand
+
+RATE = 400.0
+"""veh/h per origin where nothing else is said."""
+
+DT = 0.1
+"""s, physics step of what is timed."""
+
+PEER_TIME = 3.0
+"""s of stepping after which a process of the peer has run long enough."""
 
 
 def bench_maps(
@@ -40,8 +57,7 @@ def bench_maps(
     Raises:
         MapError: the map cannot be used.
     """
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []  # Linux
-    used = cores if all_cores else cores[:1]
+    used = _cores() if all_cores else _cores()[:1]
     with tempfile.TemporaryDirectory(prefix="limsim-jax-bench-") as cache:
 
         def run(stage: str, *options: str) -> dict[str, Any]:
@@ -66,6 +82,98 @@ def bench_maps(
         "cached": _medians(cached),
         **look_ups,
     }
+
+
+def bench_traffic(
+    path: str | Path,
+    *,
+    worlds: int = 256,
+    vehicles: int = 64,
+    seconds: float = 20.0,
+    repeats: int = 3,
+    rate: float = RATE,
+    peer: bool = True,
+    cold: bool = False,
+) -> dict[str, Any]:
+    """Time traffic in many worlds on all cores, or on the accelerator if there is one; next to it SUMO.
+
+    Every world starts with about as many vehicles as it has slots, or as many as find room.
+
+    Args:
+        path: map file.
+        worlds: run together.
+        vehicles: slots per world.
+        seconds: of traffic.
+        repeats: runs of which the median counts.
+        rate: veh/h per origin.
+        peer: run SUMO on the same map with the same flows, one process per core.
+        cold: compile with an empty cache, then load from it; else the user's cache is used.
+
+    Returns:
+        Figures by name; `vehicle_updates_per_s` counts vehicles on the road, `slot_updates_per_s` slots.
+        Times in s, memory in bytes. `load_s` is None unless `cold`; `peer` has a `reason` if it did not run.
+
+    Raises:
+        MapError: the map cannot be used, or not with these numbers.
+    """
+    options = {"worlds": worlds, "vehicles": vehicles, "seconds": seconds, "rate": rate, "repeats": repeats}
+    with tempfile.TemporaryDirectory(prefix="limsim-jax-bench-") as folder:
+
+        def run(repeats: int) -> dict[str, Any]:
+            told = json.dumps(options | {"repeats": repeats})
+            return _child("traffic", str(path), told, cores=_cores(), cache=folder if cold else None)
+
+        result = run(repeats)
+        result["load_s"] = run(0)["compile_s"] if cold else None
+        result["peak_memory"] = result.pop("device_memory") or round(result["peak_memory_mb"] * 1e6)
+        for name in ("process_s", "peak_memory_mb"):
+            del result[name]
+        result["peer"], result["ratio"] = None, None
+        if peer:
+            found = _peer(Path(path), Path(folder), rate, result["mean_vehicles"], seconds)
+            result["peer"] = found
+            if "reason" not in found:
+                result["ratio"] = result["vehicle_updates_per_s"] / found["vehicle_updates_per_s"]
+    return result
+
+
+def build_traffic(
+    network: Network, lane_map: LaneMap, *, rate: float, vehicles: int, seconds: float
+) -> tuple[Demand, int]:
+    """Plain traffic: the default population that fits the map, from all origins to all goals.
+
+    Args:
+        network: the map.
+        lane_map: of that map, with the default goals.
+        rate: veh/h per origin.
+        vehicles: on the road at the start.
+        seconds: for how long others come.
+
+    Returns:
+        The demand, and the number of origins.
+
+    Raises:
+        ValueError: numbers that make no sense, or more vehicles than the roads hold.
+    """
+    from limsim_jax.maps.routing import default_goals
+    from limsim_jax.traffic.demand import Flow, build_demand, entries
+    from limsim_jax.traffic.vehicles import default_population, fitting
+
+    if vehicles < 0:
+        raise ValueError(f"{vehicles} vehicles at the start? 0 or more")
+    origins = list(entries(network))
+    flows = [Flow(origin=name, rate=rate) for name in origins]
+    goals, population = default_goals(network), fitting(default_population(), lane_map)
+    km = sum(lane.length for lane in network.drivable_lanes() if lane.junction is None) / 1e3
+
+    def build(density: float) -> Demand:
+        return build_demand(network, lane_map, goals, flows, population, horizon=seconds, density=density)
+
+    density = vehicles / max(km, 1e-3)
+    demand = build(density)
+    if demand.initial not in (0, vehicles):  # lanes that are closed to all types have no places
+        demand = build(density * vehicles / demand.initial)
+    return demand, len(origins)
 
 
 def markdown(result: dict[str, Any]) -> str:
@@ -105,14 +213,55 @@ def markdown(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _child(stage: str, *arguments: str, cores: Sequence[int], cache: str) -> dict[str, Any]:
-    """Run a stage in a process of its own and return what it measured."""
+def traffic_lines(result: dict[str, Any]) -> list[tuple[str, str]]:
+    """The result of `bench_traffic` as names and values to print."""
+    r, peer = result, result["peer"]
+    compile_s = f"{r['compile_s']:.1f} s" + (" (from the cache)" if r["from_cache"] else " cold")
+    if r["load_s"] is not None:
+        compile_s += f", {r['load_s']:.1f} s from the cache"
+    lines = [
+        (
+            "map",
+            f"{r['map']}: {r['worlds']} worlds x {r['vehicles']} slots x {r['steps']} steps of {r['dt']:g} s",
+        ),
+        ("device", f"{r['device']}, {r['devices']} device{'s' * (r['devices'] > 1)}, {r['cores']} cores"),
+        (
+            "vehicle-updates/s",
+            f"{r['vehicle_updates_per_s']:.3g}, {r['mean_vehicles']:.1f} vehicles per world",
+        ),
+        ("slot-updates/s", f"{r['slot_updates_per_s']:.3g}"),
+        ("world-steps/s", f"{r['world_steps_per_s']:.3g}"),
+        ("run", f"{r['run_s']:.2f} s, median of {r['repeats']}"),
+        ("trace and compile", compile_s),
+        ("peak memory", f"{r['peak_memory'] / 1e6:.0f} MB"),
+    ]
+    if peer is not None and "reason" in peer:
+        lines.append(("SUMO", f"not run: {peer['reason']}"))
+    elif peer is not None:
+        lines += [
+            (
+                peer["name"],
+                f"{peer['vehicle_updates_per_s']:.3g} vehicle-updates/s, {peer['processes']} processes, "
+                f"{peer['mean_vehicles']:.1f} vehicles per world",
+            ),
+            ("ratio", f"{r['ratio']:.1f}"),
+        ]
+    return lines
+
+
+def _cores() -> list[int]:
+    """Cores that this process may use; empty where the system does not tell."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []  # Linux
+
+
+def _child(stage: str, *arguments: str, cores: Sequence[int], cache: str | None) -> dict[str, Any]:
+    """Run a stage in a process of its own and return what it measured; `cache` None: that of the user."""
     start = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-m", "limsim_jax.bench", ",".join(map(str, cores)), stage, *arguments],
         capture_output=True,
         text=True,
-        env=os.environ | {"LIMSIM_JAX_CACHE": cache},
+        env=os.environ | ({} if cache is None else {"LIMSIM_JAX_CACHE": cache}),
     )
     if done.returncode == 2:
         raise MapError(**json.loads(done.stderr.splitlines()[-1]), file=arguments[0])
@@ -125,7 +274,13 @@ def _main(cores: str, stage: str, path: str, *options: str) -> int:
     """Be the child: only these cores, and one line of JSON for the parent."""
     if cores:
         os.sched_setaffinity(0, {int(core) for core in cores.split(",")})
-    run: dict[str, Callable[..., dict[str, Any]]] = {"cold": _cold, "cached": _cached, "look_ups": _look_ups}
+    run: dict[str, Callable[..., dict[str, Any]]] = {
+        "cold": _cold,
+        "cached": _cached,
+        "look_ups": _look_ups,
+        "traffic": _traffic,
+        "sumo": _sumo,
+    }
     try:
         result = run[stage](path, *options)
     except MapError as error:
@@ -219,6 +374,205 @@ def _look_ups(path: str, repeats: str, *batches: str) -> dict[str, Any]:
     device = jax.devices()[0]
     machine = {"device": device.device_kind, "platform": device.platform, "jax": jax.__version__}
     return {"machine": machine, "look_ups": rows}
+
+
+def _traffic(path: str, told: str) -> dict[str, Any]:
+    """Time many worlds."""
+    import jax
+    import numpy as np
+
+    from limsim_jax.maps import build_lane_map, load_map
+    from limsim_jax.rollout import Rollout, Worlds, use_all_cores
+    from limsim_jax.traffic.demand import sample_scenario
+    from limsim_jax.traffic.engine import Traffic
+    from limsim_jax.types import Config
+
+    options = json.loads(told)
+    worlds, slots, seconds, repeats = (options[x] for x in ("worlds", "vehicles", "seconds", "repeats"))
+    use_all_cores()
+    hits = []
+    jax.monitoring.register_event_listener(
+        lambda event, **_: hits.append(event) if event == "/jax/compilation_cache/cache_hits" else None
+    )
+    network = load_map(path)
+    lane_map = build_lane_map(network)
+    demand = _full(network, lane_map, options["rate"], slots, seconds)
+    run = Rollout(Config(dt=DT), Traffic(), seconds)
+    before, start = len(hits), time.perf_counter()
+    many = Worlds(run, lane_map, lambda key: sample_scenario(demand, lane_map, key, slots), chunk=worlds)
+    many.compile()
+    compile_s = time.perf_counter() - start
+    steps = run.decisions * run.config.decision_every
+    seconds_of, updates_of = [], []
+    for i in range(repeats + 1 if repeats else 0):  # the first one does not count
+        start = time.perf_counter()
+        totals = many.run_totals(range(i * many.chunk, (i + 1) * many.chunk))
+        seconds_of.append(time.perf_counter() - start)
+        updates_of.append(float(np.sum(totals.time, dtype=np.float64)) / DT)
+    device = jax.devices()[0]
+    facts = {
+        "map": Path(path).name,
+        "worlds": many.chunk,
+        "vehicles": slots,
+        "steps": steps,
+        "dt": DT,
+        "seconds": seconds,
+        "rate": options["rate"],
+        "initial": demand.initial,
+        "device": _processor() if device.platform == "cpu" else device.device_kind,
+        "platform": device.platform,
+        "devices": jax.local_device_count(),
+        "cores": len(_cores()) or os.cpu_count(),
+        "jax": jax.__version__,
+        "limsim_jax": __version__,
+        "compile_s": compile_s,
+        "from_cache": len(hits) > before,
+        "repeats": repeats,
+        "device_memory": (device.memory_stats() or {}).get("peak_bytes_in_use"),
+    }
+    if not repeats:
+        return facts
+    run_s, updates = statistics.median(seconds_of[1:]), statistics.median(updates_of[1:])
+    rates = [updates / s for updates, s in zip(updates_of[1:], seconds_of[1:], strict=True)]
+    return facts | {
+        "run_s": run_s,
+        "mean_vehicles": updates / (many.chunk * steps),
+        "vehicle_updates_per_s": statistics.median(rates),
+        "slot_updates_per_s": many.chunk * slots * steps / run_s,
+        "world_steps_per_s": many.chunk * steps / run_s,
+    }
+
+
+def _full(network: Network, lane_map: LaneMap, rate: float, slots: int, seconds: float) -> Demand:
+    """Traffic that starts with as many vehicles as there are slots, or as find room."""
+    vehicles = slots
+    while True:
+        try:
+            return build_traffic(network, lane_map, rate=rate, vehicles=vehicles, seconds=seconds)[0]
+        except ValueError as error:
+            if "places" not in str(error):
+                raise MapError(str(error)) from error
+            vehicles = int(0.8 * vehicles)
+
+
+# --- the peer ----------------------------------------------------------------------------------------
+
+
+def _peer(path: Path, folder: Path, rate: float, vehicles: float, seconds: float) -> dict[str, Any]:
+    """SUMO on the same map with the same flows; `reason` if it cannot run."""
+    name = "SUMO"
+    try:
+        import libsumo  # pyright: ignore[reportMissingImports]
+        import sumolib
+
+        name = f"SUMO {libsumo.getVersion()[1].removeprefix('SUMO ')}"
+        net = _sumo_network(path, folder)
+        routes = _sumo_demand(sumolib.net.readNet(str(net)), folder, rate, round(vehicles), seconds)
+    except ModuleNotFoundError as error:
+        return {"name": name, "reason": f"{error.name} is not installed"}
+    except _NoPeer as error:
+        return {"name": name, "reason": str(error)}
+    cores = _cores() or list(range(os.cpu_count() or 1))
+    with ThreadPoolExecutor(len(cores)) as pool:
+        runs = list(
+            pool.map(
+                lambda core: _child("sumo", str(net), str(routes), str(seconds), cores=[core], cache=None),
+                cores,
+            )
+        )
+    return {
+        "name": name,
+        "processes": len(cores),
+        "model": "IDM, LC2013",
+        "vehicle_updates_per_s": sum(run["updates"] / run["step_s"] for run in runs),
+        "mean_vehicles": sum(run["updates"] for run in runs) / sum(run["steps"] for run in runs),
+        "episodes": sum(run["episodes"] for run in runs),
+    }
+
+
+class _NoPeer(Exception):
+    """Why SUMO cannot be compared with."""
+
+
+def _sumo_network(path: Path, folder: Path) -> Path:
+    """The map as a SUMO network."""
+    if path.name.removesuffix(".gz").endswith(".net.xml"):
+        return path
+    try:
+        import sumo  # the wheel that brings the programs
+
+        program = str(Path(sumo.SUMO_HOME) / "bin" / "netconvert")
+    except ModuleNotFoundError:
+        program = shutil.which("netconvert")
+    if program is None or not Path(program).exists():
+        raise _NoPeer("netconvert is not installed (eclipse-sumo)")
+    net = folder / "map.net.xml"
+    # turns at dead ends, which netconvert would add, make loops of ways out
+    command = [program, "--opendrive-files", str(path), "--no-turnarounds", "true", "-o", str(net)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode or not net.exists():
+        said = (done.stderr.strip() or "no message").splitlines()[-1]
+        raise _NoPeer(f"netconvert cannot convert {path.name}: {said}")
+    return net
+
+
+def _sumo_demand(net: Any, folder: Path, rate: float, vehicles: int, seconds: float) -> Path:
+    """Flows from every edge into the network to every way out in equal shares; vehicles at the start."""
+    edges = {edge.getID(): edge for edge in net.getEdges() if edge.allows("passenger")}
+    after = {
+        name: [x.getID() for x in edge.getOutgoing() if x.getID() in edges] for name, edge in edges.items()
+    }
+    entered = {x for names in after.values() for x in names}
+
+    def exits(start: str) -> list[str]:
+        seen, new = {start}, [start]
+        while new:
+            new = [x for name in new for x in after[name] if not (x in seen or seen.add(x))]
+        return sorted(x for x in seen if not after[x])
+
+    reach = {name: found for name in edges if (found := exits(name))}
+    sources = [name for name in reach if name not in entered]
+    if not reach or (rate > 0 and not sources):
+        raise _NoPeer("the converted network has no way in and out")
+    rng = random.Random(0)
+    lines = ['<routes><vType id="car" carFollowModel="IDM"/>']
+    weight = [edges[x].getLength() * edges[x].getLaneNumber() for x in reach]
+    for i, name in enumerate(rng.choices(list(reach), weight, k=vehicles)):
+        lines.append(
+            f'<trip id="start{i}" type="car" depart="0" from="{name}" to="{rng.choice(reach[name])}" '
+            'departPos="random_free" departLane="random" departSpeed="desired"/>'
+        )
+    for name in sources if rate > 0 else []:
+        for goal in reach[name]:
+            each = rate / 3600 / len(reach[name])
+            lines.append(
+                f'<flow id="{name}_{goal}" type="car" begin="0" end="{seconds}" from="{name}" to="{goal}" '
+                f'period="exp({each})" departLane="best" departSpeed="max"/>'
+            )
+    path = folder / "traffic.rou.xml"
+    path.write_text("\n".join([*lines, "</routes>"]))
+    return path
+
+
+def _sumo(net: str, routes: str, seconds: str) -> dict[str, Any]:
+    """Step episodes one after the other; only the steps are timed."""
+    import libsumo  # pyright: ignore[reportMissingImports]
+
+    steps, updates, episodes, spent = 0, 0, 0, 0.0
+    while spent < PEER_TIME:
+        options = ["-n", net, "-r", routes, "--step-length", str(DT), "--seed", str(episodes)]
+        quiet = ["--no-step-log", "--no-warnings", "--xml-validation", "never", "--duration-log.disable"]
+        libsumo.start(["sumo", *options, *quiet])
+        libsumo.simulationStep()  # vehicles of the start enter
+        start = time.perf_counter()
+        for _ in range(round(float(seconds) / DT)):
+            libsumo.simulationStep()
+            updates += libsumo.vehicle.getIDCount()
+        spent += time.perf_counter() - start
+        libsumo.close()
+        steps += round(float(seconds) / DT)
+        episodes += 1
+    return {"steps": steps, "updates": updates, "episodes": episodes, "step_s": spent}
 
 
 def _time(function: Callable[..., Any], repeats: int, *arguments: Any) -> dict[str, float]:

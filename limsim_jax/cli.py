@@ -6,8 +6,12 @@ A user's error is one line on stderr and exit code 2. A bug is a traceback.
 from __future__ import annotations
 
 import copy
+import errno
 import json
+import math
+import os
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,7 +21,9 @@ import typer
 from limsim_jax import __version__
 
 if TYPE_CHECKING:
+    from limsim_jax.maps.lane_map import LaneMap
     from limsim_jax.maps.network import ImportReport, Network
+    from limsim_jax.rollout import Totals, Trace
 
 app = typer.Typer(
     help="Road traffic for validating automated driving.",
@@ -164,6 +170,165 @@ def check(
     return 1 if findings else 0
 
 
+@app.command()
+def run(
+    file: Annotated[str, typer.Argument(metavar="MAP", help="Name of a bundled map, or a map file.")],
+    seconds: Annotated[float, typer.Option(help="Seconds of traffic.")] = 60.0,
+    seed: Annotated[int, typer.Option(help="Another seed is another world.")] = 0,
+    rate: Annotated[
+        float | None, typer.Option(help="Vehicles per hour that come in at each origin.  [default: 400]")
+    ] = None,
+    vehicles: Annotated[int, typer.Option(help="Vehicles on the road at the start.")] = 20,
+    slots: Annotated[int, typer.Option(help="Vehicles that can be on the road at once.")] = 64,
+    dt: Annotated[float, typer.Option(help="Physics step, s.")] = 0.1,
+    video: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a video: .gif or .mp4, 10 frames per second.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a picture of the end: .png.")
+    ] = None,
+    bounds: Annotated[
+        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="Show this window (m) of the map.")
+    ] = None,
+    trace_file: Annotated[
+        Path | None, typer.Option("--trace", metavar="FILE", help="Write every step: .npz or .parquet.")
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Run one world of traffic and say what happened."""
+    for name, value in (("--seconds", seconds), ("--dt", dt)):
+        if not (value > 0 and math.isfinite(value)):
+            raise typer.BadParameter(f"{value:g} s; it has to be above 0", param_hint=name)
+    if dt > 0.5:
+        raise typer.BadParameter(f"{dt:g} s is too coarse for traffic; at most 0.5", param_hint="--dt")
+    if rate is not None and not (rate >= 0 and math.isfinite(rate)):
+        raise typer.BadParameter(f"{rate:g} veh/h; it has to be 0 or more", param_hint="--rate")
+    if not 0 <= seed < 2**31:
+        raise typer.BadParameter(f"{seed}; it has to be within 0 and 2^31 - 1", param_hint="--seed")
+    if slots < 1:
+        raise typer.BadParameter(f"{slots}; at least 1", param_hint="--slots")
+    if vehicles < 0:
+        raise typer.BadParameter(f"{vehicles}; it has to be 0 or more", param_hint="--vehicles")
+    if vehicles > slots:
+        message = f"{vehicles} do not fit into {slots} slots; ask for more with --slots"
+        raise typer.BadParameter(message, param_hint="--vehicles")
+    window = None if bounds is None else _window(bounds)
+    _check_outputs(video, picture, trace_file)
+    for path in (video, picture, trace_file, json_file):
+        if path is not None:
+            _check_writable(path)
+    network = _load(file, no_cache=False)
+
+    import jax
+    import numpy as np
+
+    from limsim_jax.bench import RATE, build_traffic
+    from limsim_jax.maps import build_lane_map
+    from limsim_jax.maps.network import MapError
+    from limsim_jax.rollout import Result, Rollout, enable_compilation_cache, trace, world_key
+    from limsim_jax.traffic.demand import sample_scenario
+    from limsim_jax.traffic.engine import Traffic
+    from limsim_jax.types import Config
+
+    lane_map = build_lane_map(network)
+    per_origin = RATE if rate is None else rate
+    try:
+        demand, origins = build_traffic(
+            network, lane_map, rate=per_origin, vehicles=vehicles, seconds=seconds
+        )
+        if demand.initial > slots:
+            raise ValueError(f"{demand.initial} vehicles at the start do not fit into {slots} slots")
+    except ValueError as error:
+        raise MapError(str(error), file=network.source) from None
+    wants_trace = any(path is not None for path in (video, picture, trace_file))
+    # decisions about every half a second, as with steps of 0.1 s
+    config = Config(dt=dt, decision_every=max(1, round(0.5 / dt)))
+    rollout = Rollout(config, Traffic(), seconds, record=trace if wants_trace else None)
+
+    arrays, structure = jax.tree.flatten(lane_map)
+
+    @jax.jit
+    def world(arrays: list[Any], seed: Any) -> Result:  # the world of this seed in a batch, too
+        lane_map = jax.tree.unflatten(structure, arrays)
+        scenario_key, policy_key = jax.random.split(world_key(seed))
+        return rollout(lane_map, sample_scenario(demand, lane_map, scenario_key, slots), policy_key)
+
+    enable_compilation_cache()
+    start = time.perf_counter()
+    compiled = world.lower(arrays, np.int32(seed)).compile()
+    built = time.perf_counter()
+    result = jax.device_get(compiled(arrays, np.int32(seed)))
+    done = time.perf_counter()
+    given = "" if rate is not None else " (default)"
+    arrivals = f"{per_origin:g} veh/h{given} at each of {origins} origins" if origins else "no origins"
+    summary = {
+        "map": network.name or file,
+        "source": network.source,
+        "file_hash": network.file_hash,
+        "seed": seed,
+        "seconds": rollout.decisions * config.decision_time,
+        "dt": dt,
+        "rate": per_origin,
+        "origins": origins,
+        "initial": demand.initial,
+        "slots": slots,
+        **_outcome(result.totals),
+        "compile_s": built - start,
+        "run_s": done - built,
+    }
+    if json_file is not None:
+        _write_json(json_file, summary)
+    _show(f"{Path(network.source).name}, {summary['seconds']:g} s, seed {seed}", arrivals, summary)
+    if trace_file is not None:
+        _write_trace(trace_file, network, lane_map, result.trace)
+    if picture is not None or video is not None:
+        from limsim_jax.report.video import write_picture, write_video
+
+        if picture is not None:
+            write_picture(picture, network, lane_map, result.trace, bounds=window)
+        if video is not None:
+            every = max(1, round(0.1 / dt))
+            write_video(
+                video, network, lane_map, result.trace, fps=1 / (dt * every), every=every, bounds=window
+            )
+    for path in (trace_file, picture, video, json_file):
+        if path is not None:
+            print(f"wrote {path}")
+
+
+@bench_app.command()
+def traffic(
+    file: Annotated[
+        str, typer.Argument(metavar="[MAP]", help="Name of a bundled map, or a map file.")
+    ] = "intersection",
+    worlds: Annotated[int, typer.Option(min=1, help="Worlds run together.")] = 256,
+    vehicles: Annotated[int, typer.Option(min=1, help="Vehicle slots per world.")] = 64,
+    seconds: Annotated[float, typer.Option(min=0.5, help="Seconds of traffic.")] = 20.0,
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of which the median counts.")] = 3,
+    rate: Annotated[float, typer.Option(min=0, help="Vehicles per hour at each origin.")] = 400.0,
+    cold: Annotated[
+        bool, typer.Option("--cold", help="Compile with an empty cache, then load from it.")
+    ] = False,
+    no_peer: Annotated[bool, typer.Option("--no-peer", help="Do not run SUMO next to it.")] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Time traffic in many worlds on all cores, or on the accelerator; next to it SUMO if installed."""
+    from limsim_jax.bench import bench_traffic, traffic_lines
+
+    for name, value in (("--seconds", seconds), ("--rate", rate)):
+        if not math.isfinite(value):
+            raise typer.BadParameter(f"{value:g}; it has to be finite", param_hint=name)
+    if json_file is not None:
+        _check_writable(json_file)
+    result = bench_traffic(
+        _path(file), worlds=worlds, vehicles=vehicles, seconds=seconds, repeats=repeats, rate=rate,
+        peer=not no_peer, cold=cold,
+    )  # fmt: skip
+    if json_file is not None:
+        _write_json(json_file, result)
+    _table(traffic_lines(result))
+
+
 @bench_app.command()
 def maps(
     file: Annotated[
@@ -190,6 +355,139 @@ def maps(
         command = f"limsim-jax bench maps {file}" + " --all-cores" * all_cores + f" --repeats {repeats}"
         markdown_file.write_text(f"# How fast maps load\n\nMade by `{command}`.\n\n{tables}\n")
     print(tables)
+
+
+def _check_outputs(video: Path | None, picture: Path | None, trace_file: Path | None) -> None:
+    """Refuse files that could not be written in the end, before anything takes long."""
+    try:
+        if video is not None or picture is not None:
+            from limsim_jax.report.video import PICTURE_SUFFIXES, VIDEO_SUFFIXES, check_suffix
+
+            if video is not None:
+                check_suffix(video, VIDEO_SUFFIXES)
+            if picture is not None:
+                check_suffix(picture, PICTURE_SUFFIXES)
+        if trace_file is not None and trace_file.suffix.lower() not in (".npz", ".parquet"):
+            raise ValueError(f"cannot write '{trace_file}': use .npz or .parquet")
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+    if trace_file is not None and trace_file.suffix.lower() == ".parquet":
+        try:
+            import pyarrow.parquet  # noqa: F401  # pyright: ignore[reportMissingImports]
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError(
+                f"'{trace_file}' needs pyarrow: pip install pyarrow, or write .npz"
+            ) from None
+
+
+def _check_writable(path: Path) -> None:
+    """Raise `OSError` about a file that cannot be written."""
+    target = path if path.exists() else path.parent
+    if path.is_dir():
+        code = errno.EISDIR
+    elif not path.parent.is_dir():
+        code = errno.ENOTDIR if path.parent.exists() else errno.ENOENT
+    elif not os.access(target, os.W_OK):
+        code = errno.EACCES
+    else:
+        return
+    raise OSError(code, os.strerror(code), str(path))
+
+
+def _outcome(totals: Totals) -> dict[str, Any]:
+    """Totals of one world as plain values, and the means that they give."""
+    plain = {name: value.item() for name, value in vars(totals).items()}
+    distance, driven, travel = plain.pop("distance"), plain.pop("time"), plain.pop("travel_time")
+    return plain | {
+        "vehicle_km": distance / 1e3,
+        "mean_speed": distance / driven if driven else None,
+        "mean_travel_time": travel / plain["left"] if plain["left"] else None,
+    }
+
+
+def _show(title: str, arrivals: str, summary: dict[str, Any]) -> None:
+    """Print the summary of a run."""
+
+    def number(name: str, unit: str) -> str:
+        return "-" if summary[name] is None else f"{summary[name]:.1f} {unit}"
+
+    slots = f"  ({summary['full']} times no slot was free: --slots)" if summary["full"] else ""
+    incidents = {
+        "off_road": "off the road", "wrong_way": "wrong way", "ran_red": "ran a red light",
+        "missed": "missed their lane change", "hard": "braked beyond their limit",
+        "broken": "with numbers that are not finite",
+    }  # fmt: skip
+    others = [f"{summary[name]} {text}" for name, text in incidents.items() if summary[name]]
+    if summary["gridlock"]:
+        others.append("gridlock")
+    _table(
+        [
+            ("arrivals", arrivals),
+            ("entered", f"{summary['entered']}, {summary['initial']} of them there at the start"),
+            ("left", str(summary["left"])),
+            ("waiting to enter", f"{summary['waiting']}{slots}"),
+            ("collided", str(summary["collided"])),
+            ("other incidents", ", ".join(others) or "none"),
+            ("mean speed", number("mean_speed", "m/s")),
+            ("mean travel time", number("mean_travel_time", "s, of those who left")),
+            ("hardest braking", number("deceleration", "m/s^2")),
+            ("longest wait", number("longest_wait", "s")),
+            ("compile", number("compile_s", "s")),
+            ("run", f"{summary['run_s']:.2f} s"),
+        ],
+        title,
+    )
+
+
+def _table(lines: list[tuple[str, str]], title: str | None = None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for name, value in lines:
+        table.add_row(Text(name), Text(value))
+    console = Console()
+    if title is not None:
+        console.print(Text(title, style="bold"))
+    console.print(table)
+
+
+def _write_trace(path: Path, network: Network, lane_map: LaneMap, trace: Trace) -> None:
+    """Every step as arrays (.npz) or one row per step and vehicle (.parquet); x, y as in the map file."""
+    import numpy as np
+
+    from limsim_jax.maps.lane_map import absolute, lane_ids
+
+    x, y = absolute(lane_map, trace.box[..., 0], trace.box[..., 1])
+    ids = np.array(lane_ids(network))
+    slot = np.broadcast_to(np.arange(trace.active.shape[1]), trace.active.shape)
+    columns = {
+        "time": np.broadcast_to(trace.time[:, None], trace.active.shape),
+        # those of the start have no row of the schedule: numbers below 0
+        "vehicle": np.where(trace.vehicle < 0, -1 - slot, trace.vehicle),
+        "slot": slot,
+        "lane": trace.lane,
+        **{name: getattr(trace, name) for name in ("s", "d", "v", "a")},
+        "x": x,
+        "y": y,
+        "heading": trace.box[..., 2],
+        "length": trace.box[..., 3],
+        "width": trace.box[..., 4],
+        "status": trace.status,
+    }
+    if path.suffix.lower() == ".npz":
+        arrays = columns | {"time": trace.time, "active": trace.active, "phase": trace.phase, "lane_ids": ids}
+        del arrays["slot"]
+        with path.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+        return
+    import pyarrow  # pyright: ignore[reportMissingImports]
+    import pyarrow.parquet  # pyright: ignore[reportMissingImports]
+
+    rows = {name: np.ascontiguousarray(column[trace.active]) for name, column in columns.items()}
+    rows["lane"] = ids[rows["lane"]]
+    pyarrow.parquet.write_table(pyarrow.table(rows), path)
 
 
 def _path(file: str) -> Path:

@@ -36,7 +36,7 @@ from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, Scenario, Schedule, State, Status
 
 GRIDLOCK = 120.0
-"""s of standing after which a vehicle counts as stuck, and its world as gridlocked; red lights are shorter."""
+"""s of standing after which a vehicle is stuck and its world gridlocked; longer than lights are red."""
 
 
 @struct.dataclass(frozen=True, kw_only=True)

@@ -70,6 +70,8 @@ def test_help_names_every_command():
     assert result.exit_code == 0
     for command in ("info", "draw", "check"):
         assert command in result.output
+    result = CliRunner().invoke(cli.app, ["bench", "--help"])
+    assert "maps" in result.output and "traffic" in result.output
 
 
 @pytest.mark.parametrize("name", sorted(lj.bundled_maps()))
@@ -197,6 +199,25 @@ REFUSALS = {
     "no runs": ("bench maps ok.xodr --repeats 0", "--repeats"),
     "bench of nothing": ("bench maps none.xodr", "none.xodr"),
     "bench of a cut file": ("bench maps cut.xodr --repeats 1", "cut.xodr:"),
+    "run of nothing": ("run highwy", "bundled are"),
+    "run of a cut file": ("run cut.xodr", "cut.xodr:"),
+    "no time": ("run ok.xodr --seconds 0", "--seconds"),
+    "time that is no number": ("run ok.xodr --seconds nan", "--seconds"),
+    "negative rate": ("run ok.xodr --rate -1", "-1 veh/h"),
+    "more vehicles than slots": ("run ok.xodr --vehicles 65", "65 do not fit into 64 slots"),
+    "negative vehicles": ("run ok.xodr --vehicles -1", "--vehicles"),
+    "more vehicles than road": ("run ok.xodr --vehicles 60", "places"),
+    "no slots": ("run ok.xodr --slots 0 --vehicles 0", "--slots"),
+    "negative seed": ("run ok.xodr --seed -1", "--seed"),
+    "long steps": ("run ok.xodr --dt 2", "--dt"),
+    "trace folder": ("run ok.xodr --trace nowhere/x.npz", "nowhere/x.npz"),
+    "output is a folder": ("run ok.xodr --json folder", "folder"),
+    "unknown trace": ("run ok.xodr --trace x.csv", ".parquet"),
+    "unknown video": ("run ok.xodr --video x.avi", "x.avi"),
+    "bench of no traffic": ("bench traffic none.xodr", "none.xodr"),
+    "bench of no worlds": ("bench traffic ok.xodr --worlds 0", "--worlds"),
+    "bench with a bad rate": ("bench traffic ok.xodr --rate -2", "--rate"),
+    "bench JSON folder": ("bench traffic ok.xodr --json nowhere/x.json", "nowhere/x.json"),
 }
 
 

@@ -72,7 +72,7 @@ def test_of_two_vehicles_exactly_one_goes_first(merges):
     np.testing.assert_array_equal(np.asarray(one), ~np.asarray(other))
     assert 0.3 < np.asarray(one).mean() < 0.7
     # who is on the stretch goes before who is not
-    on, off = np.asarray(mine.start - me.y) <= 0, np.asarray(theirs.start - foe.y) > np.asarray(foe.brake)
+    on, off = np.asarray(mine.start - me.y) <= -0.5, np.asarray(theirs.start - foe.y) > np.asarray(foe.brake)
     assert np.asarray(one)[on & off].all() and (on & off).sum() > 100
 
 

@@ -254,7 +254,8 @@ def drive(
         state, x = carry
         state = replace(state, **fixed)
         state, dx, left = _step(config, traffic, lane_map, state, decision, x, command)
-        out = None if record is None else record(Tick(state, left, state.step.astype(jnp.float32) * config.dt))
+        time = state.step.astype(jnp.float32) * config.dt
+        out = None if record is None else record(Tick(state, left, time))
         return (bare(state), x + dx), out
 
     before, x = state.lane, jnp.zeros_like(state.s)

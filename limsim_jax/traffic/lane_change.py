@@ -177,9 +177,10 @@ def choose_lane(
         (pair.lead < 0) | ((own_then > -b_safe) & (pair.lead_gap > ROOM))
     )
     # a change away from the route must leave time to come back, and none is begun that the lane cannot hold
-    away = (wanted * side < 0) | ((wanted == side) & farther) | ((wanted == 0) & (routes.lanes_to_go[lane, state.goal] != 0))
+    back_to_go = routes.lanes_to_go[lane, state.goal]
+    away = (wanted * side < 0) | ((wanted == side) & farther) | ((wanted == 0) & (back_to_go != 0))
     back = routes.change_distance[lane, state.goal] - s
-    count = jnp.abs(routes.lanes_to_go[lane, state.goal]).astype(back.dtype)
+    count = jnp.abs(back_to_go).astype(back.dtype)
     late = away & (back < 3 * jnp.maximum(state.v, SLOWEST) * driver.lane_change_time * (count + 1))
     rested = (state.rest <= 0) | (press > 0)
     starts = allowed & reachable & safe & ~late & rested & (advantage > driver.threshold)

@@ -285,7 +285,7 @@ def _meet(
     behind = (s_out - me.y) - (f_out - other.y + other.length)
     s0, T, b = (x[vehicle][:, None] for x in (driver.s0, driver.T, driver.b))
     reach = behind + other.v * other.v / (2 * b)
-    follows = waits & merges & (((behind > s0 + 0.5 * T * me.v) & (reach > distance_in)) | (distance_in <= 0))
+    follows = waits & merges & (((behind > s0 + 0.5 * T * me.v) & (reach > distance_in)) | (distance_in <= -_MARGIN))
     # keep clear: nobody enters behind a slow vehicle only to stand where others cross
     clear = (table.cross_s[k][:, None] - me.y) + me.length + s0
     stands = (table.cross_s[k][:, None] > 0) & (me.line > -_MARGIN) & (other.v < 2 * _STANDS)
@@ -334,8 +334,8 @@ def _goes_first(
 ) -> Array:
     """Whether `me` goes before `foe`: the negation of the same with the roles swapped."""  # fmt: skip
     in_me, in_foe = mine.start - me.y, theirs.start - foe.y
-    level_me = (in_me <= 0).astype(jnp.int32) + (in_me < me.brake).astype(jnp.int32)
-    level_foe = (in_foe <= 0).astype(jnp.int32) + (in_foe < foe.brake).astype(jnp.int32)
+    level_me = (in_me <= -_MARGIN).astype(jnp.int32) + (in_me < me.brake).astype(jnp.int32)
+    level_foe = (in_foe <= -_MARGIN).astype(jnp.int32) + (in_foe < foe.brake).astype(jnp.int32)
     soon_me, soon_foe = travel_time(in_me, me.v, me.fast, me.a), travel_time(in_foe, foe.v, foe.fast, foe.a)
     before = me.slot < foe.slot
     # both inside, or both unable to stop: who is further on

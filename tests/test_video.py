@@ -1,0 +1,234 @@
+"""Pictures and videos: what is drawn agrees with the trace, and files are what their suffix says."""
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("matplotlib")
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from PIL import Image
+from traffic_worlds import bundled
+
+from limsim_jax.maps.lane_map import absolute, lane_rows
+from limsim_jax.maps.signals import SignalState
+from limsim_jax.report import video
+from limsim_jax.report.video import COLLIDED, EGO, SIGNALS, draw_frame, write_picture, write_video
+from limsim_jax.rollout import Trace
+from limsim_jax.types import Status
+
+T, N = 12, 5
+HIT, OWN, LATE, GONE = 1, 2, 3, 4  # slots: collided, an ego, another vehicle from step 6 on, never there
+
+
+def made(name: str) -> Any:
+    """A map, and a trace made by hand: every slot with its own speed, size, heading and place."""
+    network, lane_map = bundled(name)
+    step, slot = np.arange(T)[:, None], np.arange(N)[None]
+    v = (1.0 + 2.0 * slot + 0 * step).astype(np.float32)
+    heading = 0.4 * slot + 0 * step
+    x, y = 10.0 * slot + 0.1 * step * v * np.cos(heading), 5.0 * slot + 0.1 * step * v * np.sin(heading)
+    box = np.stack([x, y, heading, 4.0 + slot + 0 * step, 1.5 + 0.2 * slot + 0 * step], -1)
+    zero, whole = np.zeros((T, N), np.float32), np.zeros((T, N), np.int32)
+    fields: dict[str, Any] = dict(
+        time=np.float32(0.1) * np.arange(1, T + 1, dtype=np.float32),
+        active=(slot != GONE) & (step >= 0),
+        vehicle=np.where((slot == LATE) & (step < 6), 7, slot + 0 * step).astype(np.int32),
+        lane=whole,
+        s=zero,
+        d=zero,
+        v=v,
+        a=zero,
+        box=box.astype(np.float32),
+        status=np.where(slot == HIT, int(Status.COLLIDED), 0) + whole,
+        phase=np.zeros((T, lane_map.signals.duration.shape[0]), np.int32),
+    )
+    trace = Trace(**fields)
+    return network, lane_map, trace
+
+
+@pytest.fixture(scope="module")
+def world() -> Any:
+    return made("roundabout")
+
+
+def frames_of(image: Any) -> int:
+    return image.n_frames
+
+
+def axes():
+    return Figure(figsize=(12, 12), dpi=200).add_axes((0, 0, 1, 1))
+
+
+def test_boxes_lie_where_the_trace_says(world):
+    network, lane_map, trace = world
+    near = (-40.0, -40.0, 60.0, 60.0)
+    drawn = draw_frame(axes(), network, lane_map, trace, 0.5, bounds=near)["vehicles"]
+    paths = [path.vertices[:-1] for path in drawn.get_paths()]
+    assert len(paths) == N - 1
+    for slot, path in enumerate(paths):
+        x, y, heading, length, width = trace.box[4, slot]
+        x, y = absolute(lane_map, x, y)
+        along = (path - (x, y)) @ (np.cos(heading), np.sin(heading))
+        across = (path - (x, y)) @ (-np.sin(heading), np.cos(heading))
+        np.testing.assert_allclose([along.min(), along.max()], [-length / 2, length / 2], atol=1e-4)
+        np.testing.assert_allclose([across.min(), across.max()], [-width / 2, width / 2], atol=1e-4)
+        front = along > 0
+        assert np.ptp(across[~front]) == pytest.approx(width, abs=1e-4)  # only front corners are cut
+        assert np.ptp(across[along > along.max() - 1e-3]) < 0.6 * width
+    np.testing.assert_allclose(drawn.get_array(), trace.v[4, :-1])
+
+
+def test_egos_and_collided_are_marked(world):
+    network, lane_map, trace = world
+    drawn = draw_frame(axes(), network, lane_map, trace, egos=[OWN])
+    edges = drawn["vehicles"].get_edgecolor()
+    assert (edges == to_rgba(EGO)).all(1).tolist() == [False, False, False, True]  # on top
+    assert (edges == to_rgba(COLLIDED)).all(1).tolist() == [False, True, False, False]
+    x, y = absolute(lane_map, *trace.box[-1, HIT, :2])
+    np.testing.assert_allclose(drawn["collided"].get_xydata(), [[x, y]])
+
+
+def test_tails_end_where_another_vehicle_had_the_slot(world):
+    network, lane_map, trace = world
+    tails = draw_frame(axes(), network, lane_map, trace, tail=0.85)["tails"].get_segments()
+    assert [len(tail) for tail in tails] == [9, 9, 9, 6]
+    np.testing.assert_allclose(tails[0][-1], np.stack(absolute(lane_map, *trace.box[-1, 0, :2])))
+
+
+def test_stop_lines_show_what_the_programs_say():
+    network, lane_map, trace = made("intersection")
+    durations = np.asarray(lane_map.signals.duration)
+    phases = int((durations[0] > 0).sum())
+    programs = durations.shape[0] - 1
+    phase = np.zeros_like(trace.phase)
+    phase[:, :programs] = np.arange(T)[:, None] % phases
+    trace = trace._replace(phase=phase)
+    rows, ax = lane_rows(network), axes()
+    seen = set()
+    for k in range(phases):
+        drawn = draw_frame(ax, network, lane_map, trace, float(trace.time[k]))["signals"]
+        colors = [tuple(color) for color in drawn.get_colors()]
+        middles = np.array([segment.mean(0) for segment in drawn.get_segments()])
+        for movement in network.movements:
+            light = int(np.asarray(lane_map.signals.lane_program)[rows[movement.via[0]]])
+            link = int(np.asarray(lane_map.signals.lane_link)[rows[movement.via[0]]])
+            if light < 0:
+                continue
+            state = SignalState(int(np.asarray(lane_map.signals.state)[light, k, link]))
+            lane = network.lanes[movement.incoming]
+            end = lane.pose(np.asarray(lane_map.stop_s)[rows[movement.incoming]])[0].reshape(-1)[:2]
+            near = np.hypot(*(middles - end).T) < 2.0
+            assert to_rgba(SIGNALS[state]) in [colors[i] for i in np.flatnonzero(near)]
+            seen.add(state)
+    assert {SignalState.RED, SignalState.YELLOW} < seen
+    # no lamp of the map itself, whose yellow would be taken for a signal
+    assert not [artist for artist in ax.get_children() if (artist.get_gid() or "").startswith("lights")]
+
+
+def test_bars_of_one_lane_lie_as_its_turns_do():
+    """Left, straight, right from left to right; none overlaps another."""
+    network, lane_map, _ = made("intersection")
+    rows = lane_rows(network)
+    bars, behind = video._stop_bars(network, lane_map)
+    rank = {"left": 0, "slight_left": 1, "straight": 2, "slight_right": 3, "right": 4}
+    turn = {rows[m.via[0]]: rank[m.turn.name.lower()] for m in network.movements if m.via}
+    shared = 0
+    for lane in network.drivable_lanes():
+        mine = [
+            i for i, row in enumerate(behind) if lane.successors and row in {rows[x] for x in lane.successors}
+        ]
+        if len(mine) < 2:
+            continue
+        heading = lane.heading[-1]
+        left = bars[mine] @ (-np.sin(heading), np.cos(heading))  # [K, 2]
+        order = np.argsort(-left.mean(-1))
+        assert [turn[int(behind[mine[int(i)]])] for i in order] == sorted(turn[int(behind[i])] for i in mine)
+        np.testing.assert_allclose(left[order][:-1, 1], left[order][1:, 0], atol=1e-6)
+        shared += 1
+    assert shared
+
+
+def test_a_frame_shows_nothing_of_those_before(world):
+    network, lane_map, trace = world
+    page = video._Page(network, video._Moments(network, lane_map, trace, [OWN]), 0.0, None, 100)
+    first, other, again = page.frames([0, T - 1, 0])
+    assert (first != other).any() and (first == again).all()
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_video(world, suffix, tmp_path):
+    network, lane_map, trace = world
+    path = tmp_path / f"traffic.{suffix}"
+    if suffix == "mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    write_video(path, network, lane_map, trace, fps=5, every=3)
+    if suffix == "gif":
+        with Image.open(path) as image:
+            assert (frames_of(image), image.info["duration"]) == (4, 200)
+            first = np.asarray(image.convert("RGB"), int)
+            image.seek(3)
+            last = np.asarray(image.convert("RGB"), int)
+        moved = np.abs(first - last).max(-1) > 40
+        assert 0 < moved.mean() < 0.02  # vehicles and the clock, nothing else
+    else:
+        assert path.read_bytes()[4:8] == b"ftyp"
+
+
+def test_video_follows_a_slot(world, tmp_path):
+    network, lane_map, trace = world
+    far = trace.box.copy()
+    far[T // 2 :, OWN, 0] += 150  # out of the first view
+    path = tmp_path / "follow.gif"
+    write_video(path, network, lane_map, trace._replace(box=far), every=T // 2, follow=OWN)
+    with Image.open(path) as image:
+        frames = []
+        for k in range(frames_of(image)):
+            image.seek(k)
+            frames.append(np.asarray(image.convert("RGB"), int))
+    assert len(frames) == 2
+    pink = [np.abs(frame - np.array([0xD8, 0x1B, 0x8C])).max(-1) < 30 for frame in frames]
+    assert all(p.any() for p in pink)  # the ego is in view before and after
+
+
+def test_picture(world, tmp_path):
+    network, lane_map, trace = world
+    write_picture(tmp_path / "end.png", network, lane_map, trace)
+    write_picture(tmp_path / "start.png", network, lane_map, trace, 0.1)
+    end, start = imread(tmp_path / "end.png"), imread(tmp_path / "start.png")
+    assert end.shape == start.shape and 0 < (end != start).any(-1).mean() < 0.02
+
+
+REFUSALS: dict[str, Any] = {
+    "suffix": (lambda w, p: write_video(p / "x.avi", *w), "x.avi"),
+    "picture suffix": (lambda w, p: write_picture(p / "x.jpg", *w), ".png"),
+    "time": (lambda w, p: write_picture(p / "x.png", *w, time=99.0), "time = 99"),
+    "slot": (lambda w, p: write_video(p / "x.gif", *w, follow=N), f"slot {N}"),
+    "fps": (lambda w, p: write_video(p / "x.gif", *w, fps=0), "frames per second"),
+    "every": (lambda w, p: write_video(p / "x.gif", *w, every=0), "every 0"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_refusals(case, world, tmp_path):
+    call, clue = REFUSALS[case]
+    with pytest.raises(ValueError, match=clue) as caught:
+        call(world, tmp_path)
+    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
+
+
+def test_empty_trace(world):
+    network, lane_map, trace = world
+    with pytest.raises(ValueError, match="empty"):
+        draw_frame(axes(), network, lane_map, trace._replace(time=trace.time[:0]))
+
+
+def test_missing_ffmpeg_is_told(world, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ModuleNotFoundError, match="imageio-ffmpeg"):
+        write_video(tmp_path / "x.mp4", *world)
+    assert not list(tmp_path.iterdir())
+    video.check_suffix("x.gif", video.VIDEO_SUFFIXES)  # needs no ffmpeg
