@@ -18,31 +18,61 @@ if TYPE_CHECKING:
     from limsim_jax.maps.network import Lane as Lane
     from limsim_jax.maps.network import MapError as MapError
     from limsim_jax.maps.network import Network as Network
+    from limsim_jax.rollout import Rollout as Rollout
+    from limsim_jax.rollout import Worlds as Worlds
+    from limsim_jax.traffic.demand import Flow as Flow
+    from limsim_jax.traffic.demand import build_demand as build_demand
+    from limsim_jax.traffic.demand import entries as entries
+    from limsim_jax.traffic.demand import sample_scenario as sample_scenario
+    from limsim_jax.traffic.engine import Traffic as Traffic
+    from limsim_jax.traffic.vehicles import default_population as default_population
+    from limsim_jax.traffic.vehicles import fitting as fitting
+    from limsim_jax.types import Config as Config
 
 __version__ = "0.1.0.dev0"
 
 _HOMES = {
+    "Config": "limsim_jax.types",
+    "Flow": "limsim_jax.traffic.demand",
     "Lane": "limsim_jax.maps.network",
     "LaneMap": "limsim_jax.maps.lane_map",
     "MapError": "limsim_jax.maps.network",
     "Network": "limsim_jax.maps.network",
+    "Rollout": "limsim_jax.rollout",
+    "Traffic": "limsim_jax.traffic.engine",
+    "Worlds": "limsim_jax.rollout",
+    "build_demand": "limsim_jax.traffic.demand",
     "build_lane_map": "limsim_jax.maps",
     "bundled_map": "limsim_jax.maps",
     "bundled_maps": "limsim_jax.maps",
+    "default_population": "limsim_jax.traffic.vehicles",
     "draw_map": "limsim_jax.maps.draw",
+    "entries": "limsim_jax.traffic.demand",
+    "fitting": "limsim_jax.traffic.vehicles",
     "load_map": "limsim_jax.maps",
+    "sample_scenario": "limsim_jax.traffic.demand",
 }
 
 __all__ = [
+    "Config",
+    "Flow",
     "Lane",
     "LaneMap",
     "MapError",
     "Network",
+    "Rollout",
+    "Traffic",
+    "Worlds",
+    "build_demand",
     "build_lane_map",
     "bundled_map",
     "bundled_maps",
+    "default_population",
     "draw_map",
+    "entries",
+    "fitting",
     "load_map",
+    "sample_scenario",
 ]
 
 

@@ -5,6 +5,7 @@ import functools
 import itertools
 import math
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -112,7 +113,8 @@ def test_poisson_arrivals():
     # the first 400 of some 580 headways: none is cut off by the horizon
     headway = np.concatenate([np.diff(row, prepend=100.0)[:400] for row in found])
     assert stats.kstest(headway, stats.expon(scale=6.0).cdf).pvalue > 0.01
-    assert stats.pearsonr(headway[1:], headway[:-1]).pvalue > 0.01, "independent of one another"
+    related: Any = stats.pearsonr(headway[1:], headway[:-1])
+    assert related.pvalue > 0.01, "independent of one another"
     count = np.array([len(row) for row in found])
     mean = 3500 / 6
     assert abs(count.mean() - mean) < 4 * math.sqrt(mean / len(found))
@@ -124,7 +126,7 @@ def test_poisson_arrivals():
 def test_uniform_arrivals_have_one_headway_and_any_phase():
     found, _ = arrivals("highway", Flow(origin="1_0_-3", rate=450.0, pattern="uniform"), n=64, horizon=600.0)
     assert all(len(row) == 75 for row in found)
-    np.testing.assert_allclose(np.diff(np.stack(found)), 8.0, atol=2e-4)
+    np.testing.assert_allclose(np.diff(np.stack(found)).astype(float), 8.0, atol=2e-4)
     phase = np.array([row[0] for row in found])
     assert stats.kstest(phase, stats.uniform(0, 8).cdf).pvalue > 0.01
 
@@ -218,7 +220,8 @@ def test_turning_ratios_and_classes():
     assert stats.chisquare(kind[[0, 3, 4]], np.array([0.5, 0.2, 0.3]) * used.sum()).pvalue > 0.01
     both = np.zeros((4, len(VEHICLE_CLASSES)))
     np.add.at(both, (schedule.goal[used], schedule.shape.vehicle_class[used]), 1)
-    assert stats.chi2_contingency(both[np.ix_([1, 2, 3], [0, 3, 4])]).pvalue > 0.01, "independent"
+    related: Any = stats.chi2_contingency(both[np.ix_([1, 2, 3], [0, 3, 4])])
+    assert related.pvalue > 0.01, "independent"
     reachable = np.asarray(lane_map.routes.reachable)
     assert reachable[schedule.lane[used], schedule.goal[used]].all()
     assert set(schedule.lane[used]) == {lane_rows(network)[lane] for lane in entries(network)["1"]}
@@ -758,12 +761,12 @@ def test_shared_sumo_demands(folder, rows, notes):
     assert len(found.vehicles) == rows == len(demand.vehicles) == len(set(found.vehicles))
     assert len(found.notes) == notes
     ids, table = lane_ids(network), found.lane_map.routes
-    begin = math.floor(min(v.depart for v in demand.vehicles.values()))
+    begin = math.floor(min(float(v.depart) for v in demand.vehicles.values()))
     for row, name in enumerate(found.vehicles):
         vehicle = demand.vehicles[name]
         kind = demand.types[vehicle.type]
         edges = demand.routes[vehicle.route].edges if vehicle.route else (vehicle.origin, vehicle.destination)
-        assert schedule.time[row] == pytest.approx(vehicle.depart - begin, abs=1e-2)
+        assert schedule.time[row] == pytest.approx(float(vehicle.depart) - begin, abs=1e-2)
         lane = network.lanes[ids[schedule.lane[row]]]
         assert lane.road == edges[0]
         assert table.reachable[schedule.lane[row], schedule.goal[row]]

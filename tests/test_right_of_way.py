@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ def test_travel_time_is_that_of_the_motion():
     for _ in range(20):
         distance, v, more, a = rng.uniform([0.1, 0, 0.1, 0.3], [80, 20, 10, 3])
         v_end = v + more
-        arrives = lambda t, y: y[0] - distance  # noqa: B023, E731
+        arrives: Any = lambda t, y: y[0] - distance  # noqa: B023, E731
         arrives.terminal = True
         motion = solve_ivp(
             lambda t, y: [y[1], a if y[1] < v_end else 0.0],  # noqa: B023
@@ -121,8 +122,8 @@ def test_actuated_green_lasts_while_vehicles_come():
     signals = dataclasses.replace(
         lane_map.signals,
         actuated=jnp.ones_like(lane_map.signals.actuated),
-        min_duration=lane_map.signals.duration.at[0, 0].set(5.0),
-        max_duration=lane_map.signals.duration.at[0, 0].set(30.0),
+        min_duration=jnp.asarray(lane_map.signals.duration).at[0, 0].set(5.0),
+        max_duration=jnp.asarray(lane_map.signals.duration).at[0, 0].set(30.0),
     )
     lane_map = dataclasses.replace(lane_map, signals=signals)
     green = np.asarray(signals.state[0, 0])[np.asarray(signals.lane_link)] >= int(SignalState.GREEN_MINOR)

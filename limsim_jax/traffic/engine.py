@@ -76,8 +76,8 @@ class Traffic:
 class Command:
     """What egos are told to do until the next decision; who is told nothing drives like the traffic.
 
-    A free ego needs a trajectory to follow or a control to hold; an ego that keeps to lanes may take
-    meta-actions.
+    A free ego follows a trajectory or holds a control, else it rolls on with straight wheels; an ego that
+    keeps to lanes may take meta-actions.
     """
 
     trajectory: Trajectory | None = None
@@ -131,7 +131,7 @@ def decide(
         state = start(lane_map, state, choice)
     rows = rows_ahead(config, lane_map, state, ahead)
     lights = switch(config, lane_map, state, rows.lane, rows.line)
-    yielding = give_way(lane_map, state, rows, own, lane_states(lane_map.signals, lights.phase))
+    yielding = give_way(lane_map, state, rows, own, jnp.asarray(lane_states(lane_map.signals, lights.phase)))
     state = replace(state, lights=lights, held=yielding.held, stopped=yielding.stopped)
     wall = jnp.minimum(_lane_end(lane_map, state, ahead), yielding.stop + state.driver.s0)
     obstacles = Obstacles(
@@ -285,12 +285,14 @@ def _step(
         a = at_slots(egos, told, a, ~egos.free & (command.meta >= 0))
     a = after_collision(state, a, traffic.after_collision)
     free = None
-    if command.trajectory is not None or command.control is not None:
-        control = command.control
+    if egos.slot.shape[0]:
         if command.trajectory is not None:
             time = state.step.astype(jnp.float32) * config.dt
             control = track(config, traffic.limits, state, command.trajectory, time)
-        assert control is not None
+        elif command.control is not None:
+            control = command.control
+        else:  # hands off
+            control = Control(acceleration=jnp.zeros_like(egos.x), steering=jnp.zeros_like(egos.x))
         wish = after_collision(state, control.acceleration, traffic.after_collision, egos.slot)
         control = replace(control, acceleration=wish)
         free = step_free(config, lane_map, traffic.limits, state, control)

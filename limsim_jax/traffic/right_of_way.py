@@ -77,7 +77,7 @@ class Yielding(NamedTuple):
     stop: Float[Array, " N"]  # m to where the front bumper has to stop, NO_GAP if nowhere
     lead: Int[Array, " N"]  # slot of a vehicle to follow through a merge or a split, -1 for none
     lead_gap: Float[Array, " N"]  # m to it
-    held: Bool[Array, " N"]  # kept by the right of way, a sign or a full exit, not by a light
+    held: Bool[Array, " N"]  # stands for the right of way, a sign or a full exit, not for a light
     stopped: Bool[Array, " N"]  # has stopped at the stop sign ahead
 
 
@@ -192,7 +192,7 @@ def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, shows: Int[
         until = jnp.full((n, _ROWS), NO_GAP, jnp.float32)
         lead, lead_gap = jnp.full(n, -1, jnp.int32), jnp.full(n, NO_GAP, jnp.float32)
     stop, waiting = _where_to_stop(table.wait_s[rows.connector], rows, sight, until, sign | full)
-    held = state.active & waiting.any(-1)
+    held = state.active & waiting.any(-1) & (state.v < _STANDS)  # who still moves may yet come
     stop = jnp.minimum(stop, at_light).min(-1)
     return Yielding(
         stop=jnp.where(state.active, stop, NO_GAP),
@@ -285,7 +285,8 @@ def _meet(
     behind = (s_out - me.y) - (f_out - other.y + other.length)
     s0, T, b = (x[vehicle][:, None] for x in (driver.s0, driver.T, driver.b))
     reach = behind + other.v * other.v / (2 * b)
-    follows = waits & merges & (((behind > s0 + 0.5 * T * me.v) & (reach > distance_in)) | (distance_in <= -_MARGIN))
+    eases = (behind > s0 + 0.5 * T * me.v) & (reach > distance_in)
+    follows = waits & merges & (eases | (distance_in <= -_MARGIN))
     # keep clear: nobody enters behind a slow vehicle only to stand where others cross
     clear = (table.cross_s[k][:, None] - me.y) + me.length + s0
     stands = (table.cross_s[k][:, None] > 0) & (me.line > -_MARGIN) & (other.v < 2 * _STANDS)
