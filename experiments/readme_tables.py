@@ -70,10 +70,52 @@ def speed(result: dict[str, Any]) -> str:
     return "\n".join(head + [f"| {name} | {figure} |" for name, figure in rows.items()])
 
 
+def soundness(result: dict[str, Any]) -> str:
+    """What went wrong in many episodes."""
+    rows = [
+        "| map | episodes | vehicles | vehicle-km | collisions | gridlock | off road | red light "
+        "| missed lane changes | hardest braking, m/s² |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for r in result["maps"]:
+        missed, red = (f"{100 * r[name] / r['entered']:.2f} %" for name in ("missed", "ran_red"))
+        rows.append(
+            f"| {r['map']} | {r['episodes']} | {r['entered']:,} | {r['vehicle_km']:,.0f} "
+            f"| {r['collided_episodes']} | {r['gridlock']} | {r['off_road']} | {red} | {missed} "
+            f"| {r['deceleration']:.1f} |"
+        )
+    return "\n".join(rows)
+
+
+def traffic_speed(result: dict[str, Any]) -> str:
+    """Vehicle-updates per second, next to SUMO."""
+    rows = [
+        "| map | worlds x slots | vehicle-updates/s | slot-updates/s | SUMO on the same cores | ratio |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    for r in result["cases"]:
+        peer = r["peer"] or {}
+        sumo = f"{peer['vehicle_updates_per_s']:,.0f}" if "vehicle_updates_per_s" in peer else "not run"
+        ratio = f"{r['ratio']:.1f}" if r.get("ratio") else ""
+        rows.append(
+            f"| {r['map']} | {r['worlds']} x {r['vehicles']} | {r['vehicle_updates_per_s']:,.0f} "
+            f"| {r['slot_updates_per_s']:,.0f} | {sumo} | {ratio} |"
+        )
+    first = result["cases"][0]
+    rows += [
+        "",
+        f"{first['device']}, {first['cores']} cores, steps of {first['dt']:g} s. Compiling took "
+        f"{first['compile_s']:.0f} s, loading the compiled program {first['load_s']:.0f} s.",
+    ]
+    return "\n".join(rows)
+
+
 TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "maps_against_carla": carla,
     "maps_against_sumo": sumo,
     "maps_speed": speed,
+    "soundness": soundness,
+    "traffic_speed": traffic_speed,
 }
 
 

@@ -100,7 +100,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
     lines = ["| " + " | ".join(COLUMNS.values()) + " |", "|---" * len(COLUMNS) + "|"]
     lines += ["| " + " | ".join(str(row[name]) for name in COLUMNS) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
 
 
 def main() -> None:
@@ -127,8 +127,8 @@ def main() -> None:
         jax.clear_caches()
     RESULTS.mkdir(exist_ok=True)
     head = "Regenerate: `python experiments/soundness.py`\n\n"
-    (RESULTS / f"{options.out}.json").write_text(json.dumps(rows, indent=1) + "\n")
-    (RESULTS / f"{options.out}.md").write_text(head + table(rows))
+    (RESULTS / f"{options.out}.json").write_text(json.dumps({"maps": rows}, indent=1) + "\n")
+    (RESULTS / f"{options.out}.md").write_text(head + table(rows) + "\n")
 
 
 if __name__ == "__main__":

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from limsim_jax.maps.network import ImportReport, Network
     from limsim_jax.rollout import Totals, Trace
 
+# XLA logs an error for every program that it loads from its own cache on a CPU; nothing is wrong.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 app = typer.Typer(
     help="Road traffic for validating automated driving.",
     no_args_is_help=True,
