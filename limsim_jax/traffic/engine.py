@@ -155,13 +155,12 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
     `Status.MISSED_ROUTE`.
     """
     routes = lane_map.routes
-    leads_on = (routes.next_lane[state.lane] != NO_LANE) | routes.is_goal[state.lane]  # [N, G]
-    own = jnp.take_along_axis(leads_on, state.goal[:, None], 1)[:, 0]
-    stuck = state.active & ~own & (state.waiting > PATIENCE)
+    leads_on = (routes.next_lane != NO_LANE) | routes.is_goal  # [L, G], the same for all worlds
+    nearest = jnp.argmin(jnp.where(leads_on, routes.distance, jnp.inf), -1).astype(state.goal.dtype)
+    stuck = state.active & ~leads_on[state.lane, state.goal] & (state.waiting > PATIENCE)
     stuck &= lane_map.length[state.lane] - state.s < AT_END
-    cost = jnp.where(leads_on, routes.distance[state.lane], jnp.inf)
-    goal = jnp.argmin(cost, -1).astype(state.goal.dtype)
-    changes = stuck & leads_on.any(-1)
+    goal = nearest[state.lane]
+    changes = stuck & leads_on.any(-1)[state.lane]
     return replace(
         state,
         goal=jnp.where(changes, goal, state.goal),
@@ -258,7 +257,7 @@ def drive(
         out = None if record is None else record(Tick(state, left, time))
         return (bare(state), x + dx), out
 
-    before, x = state.lane, jnp.zeros_like(state.s)
+    before, x = state, jnp.zeros_like(state.s)
     (state, _), records = lax.scan(step, (bare(state), x), None, length=config.decision_every)
     state = replace(state, **fixed)
     if traffic.look_for_contacts == "decision":
@@ -308,8 +307,9 @@ def _step(
     return state, dx, left
 
 
-def _ran_red(lane_map: LaneMap, state: State, before: Int[Array, " N"]) -> State:
-    """Record who has crossed a stop line on red since the decision, when it was on lane `before`."""
+def _ran_red(lane_map: LaneMap, state: State, before: State) -> State:
+    """Record who has crossed a stop line on red since the decision."""
     red = lane_states(lane_map.signals, state.lights.phase) == SignalState.RED
-    ran = state.active & (state.lane != before) & red[state.lane]  # nobody changes lanes behind a light
+    ran = state.active & (state.lane != before.lane) & red[state.lane]  # nobody changes lanes behind a light
+    ran &= before.s <= lane_map.stop_s[before.lane] + 0.5  # who starts beyond the line does not cross it
     return replace(state, status=state.status | jnp.where(ran, int(Status.RED_LIGHT), 0))

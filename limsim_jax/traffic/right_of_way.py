@@ -23,14 +23,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, turn_speed
 from limsim_jax.maps.signals import SignalState
 from limsim_jax.traffic.car_following import NO_GAP
-from limsim_jax.traffic.neighbors import Ahead, Pair
+from limsim_jax.traffic.neighbors import Ahead, Pair, Shelf
 from limsim_jax.types import Config, Driver, State
 
 GAP_LEAD = 1.5
@@ -56,7 +55,6 @@ _FOES = 3  # vehicles per conflict
 _BEHIND = 160.0  # m before a connector that still count as coming to it
 _PAIRS = 2  # conflicts that are looked at, per slot; more at once make vehicles wait
 _EASY = 2.0  # m/s^2, braking from which conflicts ahead matter
-_BITS = 18  # of a sort key, for the position along the connector
 _MARGIN = 0.5  # m between the front bumper and what it waits at
 _YELLOW = 2.5  # s of yellow that are counted on
 _STANDS = 1.0  # m/s, below which the vehicle ahead counts as standing
@@ -224,13 +222,12 @@ def _meet(
     connector = jnp.concatenate([rows.connector, tail[:, None]], -1).ravel()
     count = connector.shape[0]
 
-    def key(k: Array, x: Array) -> Array:
-        part = jnp.clip((x + _BEHIND) / (table.length[k] + _BEHIND), 0, 1) * (2**_BITS - 1)
-        row = jnp.where(k < 0, size, k).astype(jnp.uint32)
-        return (row << _BITS) | part.astype(jnp.uint32)
+    shelf = Shelf(size, count)
 
-    places = jnp.arange(count, dtype=jnp.int32)
-    order, entry = lax.sort((key(connector, entries.y - entries.length), places), num_keys=1)
+    def share(k: Array, x: Array) -> Array:
+        return (x + _BEHIND) / (table.length[k] + _BEHIND)
+
+    order, entry = shelf.sort(connector, share(connector, entries.y - entries.length))
 
     # which conflicts matter
     k = rows.connector
@@ -258,8 +255,8 @@ def _meet(
     s_in, s_out, f_in, f_out = (x[k, c][:, None] for x in (table.s_in, table.s_out, table.f_in, table.f_out))
     splits, merges = (kind == ConflictType.DIVERGE)[:, None], (kind == ConflictType.MERGE)[:, None]
     me = _Sight(*(x.ravel()[row][:, None] for x in sight))
-    wanted = key(foe, jnp.where(splits, me.y, f_out)[:, 0])
-    place = jnp.searchsorted(order, wanted, method="scan_unrolled")[:, None]
+    wanted = shelf.key(foe, share(foe, jnp.where(splits, me.y, f_out)[:, 0]))
+    place = shelf.first_from(order, wanted)[:, None]
     place = place + jnp.where(splits, jnp.arange(_FOES) - 1, -1 - jnp.arange(_FOES))
     index = entry[jnp.clip(place, 0, count - 1)]  # [P, Q]
     there = (place >= 0) & (place < count) & (connector[index] == foe[:, None]) & exists[:, None]
