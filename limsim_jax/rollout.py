@@ -28,8 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from limsim_jax.maps.cache import directory
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.base import Policy
-from limsim_jax.policies.base import Traffic as LikeTraffic
+from limsim_jax.policies.base import LikeTraffic, Policy
 from limsim_jax.traffic.collision import collided
 from limsim_jax.traffic.engine import Tick, Traffic, drive
 from limsim_jax.traffic.motion import boxes

@@ -26,7 +26,7 @@ class Policy(Protocol):
         ...
 
 
-class Traffic:
+class LikeTraffic:
     """The egos drive as all traffic does: car following, lane changes, right of way."""
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
