@@ -459,7 +459,8 @@ def test_shapes_order_and_padding():
     num, slots = table.foe.shape
     assert num == len(connectors(net)) + 1
     assert table.connector.shape == (len(row) + 1,)
-    assert {x.dtype for x in vars(table).values()} <= {np.dtype(np.float32), np.dtype(np.int32)}
+    kinds = {np.dtype(np.float32), np.dtype(np.int32), np.dtype(np.bool_)}
+    assert {x.dtype for x in vars(table).values()} == kinds
     for lane, r in row.items():
         k = table.connector[r]
         assert (k >= 0) == (net.lanes[lane].junction is not None)
@@ -470,6 +471,9 @@ def test_shapes_order_and_padding():
     assert (table.s_in[free] == ABSENT).all() and (table.prio[free] == 0).all()
     crossing_or_merging = (table.type == ConflictType.CROSS) | (table.type == ConflictType.MERGE)
     np.testing.assert_array_equal(table.clear_s, np.where(crossing_or_merging, table.s_out, 0).max(1))
+    crossing = table.type == ConflictType.CROSS
+    np.testing.assert_array_equal(table.cross_s, np.where(crossing, table.s_out, 0).max(1))
+    assert (table.cross_s < table.clear_s).any()
     padded = table.pad(lanes=len(row) + 20, connectors=num + 7, foes=slots + 5)
     for t in (table, padded):
         assert t.lane[-1] == t.connector[-1] == t.movement[-1] == -1
@@ -485,10 +489,22 @@ def test_shapes_order_and_padding():
         table.pad(lanes=len(row) + 1, connectors=num - 1, foes=slots)
 
 
+def test_stop_signs_are_known_at_the_first_connector():
+    net = intersection(lanes=1)
+    movements = tuple(
+        dataclasses.replace(m, control=Control.STOP) if m.index == 2 else m for m in net.movements
+    )
+    signed = dataclasses.replace(net, movements=movements)
+    table = build_conflicts(signed, rows(signed))
+    (stops,) = np.nonzero(table.must_stop)
+    first = rows(signed)[net.movements[2].via[0]]
+    assert table.lane[stops].tolist() == [first]
+
+
 def test_a_network_without_junctions_has_an_empty_table():
     net = network([straight("a", (0, 0), 0.0, 50.0)])
     table = build_conflicts(net, rows(net))
-    assert table.foe.shape == (1, 1)
+    assert table.foe.shape == (1, 0)
     assert (table.connector == -1).all()
     assert priority_cycles(table) == []
 
