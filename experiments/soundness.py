@@ -17,12 +17,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from limsim_jax.bench import build_traffic
 from limsim_jax.maps import build_lane_map, bundled_maps, load_map
-from limsim_jax.maps.routing import default_goals
 from limsim_jax.rollout import Rollout, Worlds, use_all_cores
-from limsim_jax.traffic.demand import Flow, build_demand, entries, sample_scenario
+from limsim_jax.traffic.demand import sample_scenario
 from limsim_jax.traffic.engine import Traffic
-from limsim_jax.traffic.vehicles import default_population, fitting
 from limsim_jax.types import Config
 
 RESULTS = Path(__file__).parent / "results"
@@ -41,11 +40,7 @@ def episodes(
     """Run `count` episodes on a map and add up what happened."""
     network = load_map(path)
     lane_map = build_lane_map(network)
-    goals = default_goals(network)
-    flows = [Flow(origin=name, rate=rate) for name in entries(network)]
-    km = sum(lane.length for lane in network.drivable_lanes() if lane.junction is None) / 1000
-    population = fitting(default_population(), lane_map)
-    demand = build_demand(network, lane_map, goals, flows, population, horizon=HORIZON, density=initial / km)
+    demand, _ = build_traffic(network, lane_map, rate=rate, vehicles=initial, seconds=HORIZON)
     run = Rollout(Config(dt=0.1), Traffic(), HORIZON)
     start = time.perf_counter()
     worlds = Worlds(run, lane_map, lambda key: sample_scenario(demand, lane_map, key, slots), chunk=chunk)

@@ -14,7 +14,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +30,7 @@ from limsim_jax.maps.cache import directory
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.base import LikeTraffic, Policy
 from limsim_jax.traffic.collision import collided
+from limsim_jax.traffic.demand import delayed
 from limsim_jax.traffic.engine import Tick, Traffic, drive
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, Scenario, Schedule, State, Status
@@ -156,7 +157,7 @@ class Rollout:
             now = jax.random.fold_in(key, state.step)
             command, new_memory = self.policy(self.config, lane_map, state, memory, now)
             after, records = drive(self.config, self.traffic, lane_map, state, schedule, command, record)
-            new_totals = count(self.config, lane_map, schedule, totals, state, after)
+            new_totals = count(self.config, totals, state, after)
             new = after, new_memory, new_totals
             if self.traffic.after_collision == "end":
                 over = collided(state)
@@ -166,7 +167,10 @@ class Rollout:
         length = self.decisions if decisions is None else decisions
         carry, records = lax.scan(decide, carry, None, length=length)
         records = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
-        return Result(carry[0], carry[2], records), carry
+        state, memory, totals = carry
+        late = delayed(schedule, state, self.config.time(state.step))
+        totals = replace(totals, waiting=jnp.sum(late, dtype=jnp.int32))
+        return Result(state, totals, records), (state, memory, totals)
 
 
 def begin(state: State) -> Totals:
@@ -181,12 +185,9 @@ def begin(state: State) -> Totals:
 
 
 @jax.named_scope("count")
-def count(
-    config: Config, lane_map: LaneMap, schedule: Schedule, totals: Totals, before: State, after: State
-) -> Totals:
-    """Totals after one decision more."""
-    del lane_map
-    now = after.step.astype(jnp.float32) * config.dt
+def count(config: Config, totals: Totals, before: State, after: State) -> Totals:
+    """Totals after one decision more, all but `waiting`."""
+    now = config.time(after.step)
     same = (before.vehicle == after.vehicle) & (before.entered == after.entered) & before.active
     entered = jnp.sum(after.queues.next - before.queues.next, dtype=jnp.int32)
     fresh = ~same & ((after.entered > before.entered) | (after.vehicle != before.vehicle))
@@ -198,11 +199,10 @@ def count(
     def events(bit: Status) -> Int[Array, ""]:
         return jnp.sum((new & int(bit)) != 0, dtype=jnp.int32)
 
-    due = jnp.sum((schedule.time <= now) & jnp.isfinite(schedule.time), dtype=jnp.int32)
     return Totals(
         entered=totals.entered + entered,
         left=totals.left + jnp.sum(left, dtype=jnp.int32),
-        waiting=due - jnp.sum(after.queues.next - schedule.start[:-1], dtype=jnp.int32),
+        waiting=totals.waiting,
         full=after.queues.full,
         collided=totals.collided + events(Status.COLLIDED),
         off_road=totals.off_road + events(Status.OFF_ROAD),

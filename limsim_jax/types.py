@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import enum
 
+import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
@@ -25,6 +26,10 @@ class Config:
     def decision_time(self) -> float:
         """Seconds between two decisions."""
         return self.dt * self.decision_every
+
+    def time(self, step: Int[Array, ""]) -> Float[Array, ""]:
+        """Seconds since the start after this many physics steps."""
+        return step.astype(jnp.float32) * self.dt
 
 
 @struct.dataclass(frozen=True, kw_only=True)
@@ -77,7 +82,7 @@ class Schedule:
     """Vehicles that enter from outside: sorted by origin, within an origin by time.
 
     An origin is a queue in front of one lane: its vehicles enter in order, each when there is room.
-    Rows with `time` of infinity never enter (padding).
+    Padding has a `time` that never comes.
     """
 
     time: Float[Array, " V"]  # s, wants to enter

@@ -279,7 +279,7 @@ def record(config: Config, lane_map: LaneMap, state: State) -> State:
         state,
         status=status,
         struck=jnp.where(first, touched, state.struck),
-        struck_at=jnp.where(first, state.step.astype(state.struck_at.dtype) * config.dt, state.struck_at),
+        struck_at=jnp.where(first, config.time(state.step), state.struck_at),
     )
 
 

@@ -969,7 +969,7 @@ def enter(config: Config, lane_map: LaneMap, schedule: Schedule, state: State) -
     n, origins = state.lane.shape[0], state.queues.next.shape[0]
     if not origins:
         return state
-    now = state.step.astype(jnp.float32) * config.dt
+    now = config.time(state.step)
     row = jnp.minimum(state.queues.next, schedule.time.shape[0] - 1)
     due = (state.queues.next < schedule.start[1:]) & (schedule.time[row] <= now)
 

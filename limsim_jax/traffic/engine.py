@@ -253,8 +253,7 @@ def drive(
         state, x = carry
         state = replace(state, **fixed)
         state, dx, left = _step(config, traffic, lane_map, state, decision, x, command)
-        time = state.step.astype(jnp.float32) * config.dt
-        out = None if record is None else record(Tick(state, left, time))
+        out = None if record is None else record(Tick(state, left, config.time(state.step)))
         return (bare(state), x + dx), out
 
     before, x = state, jnp.zeros_like(state.s)
@@ -286,8 +285,8 @@ def _step(
     free = None
     if egos.slot.shape[0]:
         if command.trajectory is not None:
-            time = state.step.astype(jnp.float32) * config.dt
-            control = track(config, traffic.limits, state, command.trajectory, time)
+            now = config.time(state.step)
+            control = track(config, traffic.limits, state, command.trajectory, now)
         elif command.control is not None:
             control = command.control
         else:  # hands off

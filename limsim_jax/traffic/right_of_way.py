@@ -386,7 +386,7 @@ def _lights(
     )
     at_red = (light == SignalState.RED) | (light == SignalState.RED_YELLOW)
     # who cannot stop any more drives on
-    red = at_red & (brake[:, None] <= 2 * 0.9 * state.driver.b_max[:, None] * jnp.maximum(rows.line, 0))
+    red = at_red & (brake[:, None] <= 2 * 0.9 * state.driver.b_max[:, None] * line)
     stops = (yellow | red) & (rows.x < 0) & (rows.line > -NO_GAP / 2) & (rows.connector >= 0)
     minor = (light == SignalState.GREEN_MINOR) | (light == SignalState.STOP)
     major = jnp.where(light == SignalState.GREEN_MAJOR, 1, jnp.where(minor, -1, 0))

@@ -36,8 +36,7 @@ def switch(
       line: m to the stop line before it; negative behind.
     """
     table, lights = lane_map.signals, state.lights
-    t = state.step.astype(jnp.float32) * config.dt
-    phase = phase_at(table, t)
+    phase = phase_at(table, config.time(state.step))
     start = state.step == 0
     # actuated programs
     program = table.lane_program[light]
