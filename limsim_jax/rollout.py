@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -68,6 +68,36 @@ class Result(NamedTuple):
     state: State
     totals: Totals
     trace: Any  # what `record` returned, [steps, ...]
+    measures: Any  # what `measure` found
+
+
+class Carry(NamedTuple):
+    """A run that goes on: all that `Rollout.go_on` needs to know of the past."""
+
+    state: State
+    memory: Any  # of the policy
+    totals: Totals
+    measured: Any  # by `measure` so far
+
+
+class Measure(Protocol):
+    """Metrics that are kept up while a world runs; written for one world."""
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """The carry at the start."""
+        ...
+
+    def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
+        """What `update` needs to know of a physics step."""
+        ...
+
+    def update(self, config: Config, lane_map: LaneMap, carry: Any, looks: Any) -> Any:
+        """The carry after a decision and its physics steps, `looks` `[decision_every, ...]`."""
+        ...
+
+    def result(self, config: Config, lane_map: LaneMap, carry: Any) -> Any:
+        """What was found, at the end."""
+        ...
 
 
 class Trace(NamedTuple):
@@ -118,6 +148,7 @@ class Rollout:
       horizon: s; rounded up to whole decisions.
       policy: drives the egos.
       record: of every physics step, given the lane map: `trace`, or None for none.
+      measure: metrics, or None.
     """
 
     config: Config
@@ -125,6 +156,7 @@ class Rollout:
     horizon: float
     policy: Policy = field(default_factory=LikeTraffic)
     record: Callable[[LaneMap], Callable[[Tick], Any]] | None = None
+    measure: Measure | None = None
 
     def __post_init__(self) -> None:
         if not self.horizon > 0 or not math.isfinite(self.horizon):
@@ -137,43 +169,53 @@ class Rollout:
 
     def __call__(self, lane_map: LaneMap, scenario: Scenario, key: Key[Array, ""]) -> Result:
         """Run from the start. `key` is the policy's."""
-        memory = self.policy.init(self.config, lane_map, scenario.start)
-        carry = scenario.start, memory, begin(scenario.start)
-        return self.go_on(lane_map, scenario.schedule, key, carry)[0]
+        return self.go_on(lane_map, scenario.schedule, key, self.begin(lane_map, scenario.start))[0]
+
+    def begin(self, lane_map: LaneMap, state: State) -> Carry:
+        """Before the first decision."""
+        memory = self.policy.init(self.config, lane_map, state)
+        measured = None if self.measure is None else self.measure.init(self.config, lane_map, state)
+        return Carry(state, memory, no_totals(state), measured)
 
     def go_on(
         self,
         lane_map: LaneMap,
         schedule: Schedule,
         key: Key[Array, ""],
-        carry: tuple[State, Any, Totals],
+        carry: Carry,
         decisions: int | None = None,
-    ) -> tuple[Result, tuple[State, Any, Totals]]:
-        """Run on from state, memory of the policy, and totals; gives those back, too."""
-        record = None if self.record is None else self.record(lane_map)
+    ) -> tuple[Result, Carry]:
+        """Run on, up to the horizon or for so many decisions; gives back how to run on from there."""
+        config, measure = self.config, self.measure
+        trace = None if self.record is None else self.record(lane_map)
 
-        def decide(carry: tuple[State, Any, Totals], _: None) -> tuple[tuple[State, Any, Totals], Any]:
-            state, memory, totals = carry
+        def record(tick: Tick) -> tuple[Any, Any]:
+            kept = None if trace is None else trace(tick)
+            return kept, None if measure is None else measure.look(config, lane_map, tick)
+
+        def decide(carry: Carry, _: None) -> tuple[Carry, Any]:
+            state, memory, totals, measured = carry
             now = jax.random.fold_in(key, state.step)
-            command, new_memory = self.policy(self.config, lane_map, state, memory, now)
-            after, records = drive(self.config, self.traffic, lane_map, state, schedule, command, record)
-            new_totals = count(self.config, totals, state, after)
-            new = after, new_memory, new_totals
+            command, memory = self.policy(config, lane_map, state, memory, now)
+            after, (kept, looks) = drive(config, self.traffic, lane_map, state, schedule, command, record)
+            if measure is not None:
+                measured = measure.update(config, lane_map, measured, looks)
+            new = Carry(after, memory, count(config, totals, state, after), measured)
             if self.traffic.after_collision == "end":
                 over = collided(state)
                 new = jax.tree.map(lambda x, y: jnp.where(over, x, y), carry, new)
-            return new, records
+            return new, kept
 
         length = self.decisions if decisions is None else decisions
         carry, records = lax.scan(decide, carry, None, length=length)
         records = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
-        state, memory, totals = carry
-        late = delayed(schedule, state, self.config.time(state.step))
-        totals = replace(totals, waiting=jnp.sum(late, dtype=jnp.int32))
-        return Result(state, totals, records), (state, memory, totals)
+        late = delayed(schedule, carry.state, config.time(carry.state.step))
+        carry = carry._replace(totals=replace(carry.totals, waiting=jnp.sum(late, dtype=jnp.int32)))
+        found = None if measure is None else measure.result(config, lane_map, carry.measured)
+        return Result(carry.state, carry.totals, records, found), carry
 
 
-def begin(state: State) -> Totals:
+def no_totals(state: State) -> Totals:
     """Totals at the start."""
     zero, nothing = jnp.int32(0), jnp.float32(0)
     return Totals(

@@ -70,7 +70,7 @@ def test_a_world_is_the_same_in_any_company():
 def test_saved_and_resumed_ends_as_run_through(tmp_path):
     scenario = jax.jit(sampler())(world_key(1))
     key = jax.random.key(5)
-    start = scenario.start, None, begin(scenario.start)
+    start = RUN.begin(bundled("roundabout")[1], scenario.start)
     _, carry = part()(scenario.schedule, key, start)
     save(tmp_path / "world.npz", carry)
     through, _ = part()(scenario.schedule, key, carry)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from limsim_jax import bench, bundled_map, cli, load_map
+from limsim_jax.cli import trace as trace_file
 from limsim_jax.maps import build_lane_map
 from limsim_jax.types import Status
 
@@ -30,7 +31,7 @@ def ran(tmp_path_factory):
     arguments += [f"--{name}={folder / file}" for name, file in files.items()]
     with pytest.MonkeyPatch.context() as patch:
         written = []
-        patch.setattr(cli, "_write_trace", lambda *given: (written.append(given), write(*given)))
+        patch.setattr(trace_file, "write_trace", lambda *given: (written.append(given), write(*given)))
         code = cli.main(["run", "roundabout", *arguments])
     with np.load(folder / "trace.npz") as file:
         trace = {name: file[name] for name in file.files}
@@ -40,7 +41,7 @@ def ran(tmp_path_factory):
     )
 
 
-write = cli._write_trace
+write = trace_file.write_trace
 
 
 def test_it_runs_and_writes(ran):

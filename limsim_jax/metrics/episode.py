@@ -93,7 +93,7 @@ NAMES = {
     "contact_responsibility": "blame.Responsibility for the first contact",
     "contact_delta_v": "m/s, severity of the first contact",
     "max_delta_v": "m/s, severity of the worst contact",
-    "speeding": "share of the time above the limit",
+    "speeding": "share of the time more than 0.01 m/s above the limit",
     "max_overspeed": "m/s above the limit",
     "overspeed": "m, integral of the speed above the limit",
     "off_road": "share of the time off the drivable area",
@@ -102,6 +102,7 @@ NAMES = {
     "against_flow": "m, most driven against the lane's direction within a second",
     "wrong_way": "share of the time driving against the lane's direction",
     "red_lights": "stop lines crossed on red",
+    "red_light_time": "s, when it first did",
     "stop_signs": "stop signs passed without a stop",
     "min_acceleration": "m/s^2, hardest braking, filtered",
     "max_acceleration": "m/s^2, filtered",
@@ -210,6 +211,7 @@ class EgoCarry(NamedTuple):
     against_flow: Float[Array, ""]
     wrong_way: Mean
     red_lights: Int[Array, ""]
+    red_light: Least
     stop_signs: Int[Array, ""]
     motion: MotionCarry
     limsim: LimSimCarry
@@ -267,6 +269,7 @@ class EgoMetrics:
             against_flow=zero,
             wrong_way=Mean.empty(),
             red_lights=none,
+            red_light=Least.empty(),
             stop_signs=none,
             motion=motion_init(self.dt),
             limsim=limsim_init(),
@@ -405,7 +408,7 @@ class EgoMetrics:
             rss_first=carry.rss_first.add(t, t, unsafe | tight),
             contact=contact,
             nuplan_ttc=carry.nuplan_ttc & kept,
-            speeding=share(carry.speeding, over > 0),
+            speeding=share(carry.speeding, over > 0.01),
             max_overspeed=jnp.maximum(carry.max_overspeed, over),
             overspeed=carry.overspeed + jnp.where(drove, over * dt, 0),
             off_road=share(carry.off_road, step.off_road),
@@ -414,6 +417,7 @@ class EgoMetrics:
             against_flow=jnp.maximum(carry.against_flow, against),
             wrong_way=share(carry.wrong_way, ds < -0.1 * dt),
             red_lights=carry.red_lights + step.red_light.astype(jnp.int32),
+            red_light=carry.red_light.add(t, t, step.red_light),
             stop_signs=carry.stop_signs + step.stop_sign.astype(jnp.int32),
             motion=motion,
             limsim=limsim,
@@ -511,6 +515,7 @@ class EgoMetrics:
             "against_flow": measured(carry.against_flow, carry.started),
             "wrong_way": carry.wrong_way.result(),
             "red_lights": number(carry.red_lights),
+            "red_light_time": carry.red_light.when(),
             "stop_signs": number(carry.stop_signs),
             **motion,
         }

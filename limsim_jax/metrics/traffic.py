@@ -39,6 +39,23 @@ HEADWAY_BIN = 0.5
 """s, width of the bins of the headway histogram; the last bin takes all that is longer."""
 
 
+NAMES = {
+    "mean_speed": "m/s, distance travelled by time spent",
+    "flow_per_hour": "vehicles per hour and lane",
+    "density_per_km": "vehicles per km of lane",
+    "vehicle_km": "km driven by all",
+    "delay_per_km": "s lost to others per km",
+    "delay_share": "share of the time lost to others",
+    "mean_queue": "vehicles slower than 5 km/h",
+    "max_queue": "most of them at once",
+    "lane_changes_per_km": "lane changes per km driven",
+    "trips": "vehicles that reached their goals",
+    "mean_travel_time": "s, of those",
+    "sd_travel_time": "s, standard deviation",
+}
+"""What `TrafficMetrics.result` measures."""
+
+
 class TrafficStep(NamedTuple):
     """What a step of the traffic looks like: `N` slots, after the step."""
 

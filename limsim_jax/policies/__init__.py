@@ -1,1 +1,16 @@
-"""What drives the vehicles under test."""
+"""What drives the vehicles under test.
+
+`POLICIES` has those that an experiment file can name; others are named by module and factory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from limsim_jax.policies.base import LikeTraffic, Policy
+from limsim_jax.policies.simple import ConstantSpeed
+
+POLICIES: dict[str, Callable[..., Policy]] = {
+    "like_traffic": LikeTraffic,
+    "constant_speed": ConstantSpeed,
+}

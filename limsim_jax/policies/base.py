@@ -15,6 +15,9 @@ from limsim_jax.types import Config, State
 class Policy(Protocol):
     """A pure function of the world with a memory of its own; written for one world."""
 
+    free: bool
+    """Whether its egos move in the plane, by a trajectory or by controls, or keep to lanes."""
+
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         """The memory at the start: any pytree, of the same shapes ever after."""
         ...
@@ -28,6 +31,8 @@ class Policy(Protocol):
 
 class LikeTraffic:
     """The egos drive as all traffic does: car following, lane changes, right of way."""
+
+    free = False
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         """Nothing to remember."""

@@ -38,6 +38,8 @@ from limsim_jax.maps.lane_map import (
 from limsim_jax.maps.network import Lane, Network
 from limsim_jax.numerics import safe_sqrt
 from limsim_jax.traffic.car_following import desired_speed
+from limsim_jax.traffic.ego import from_lane
+from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.neighbors import look_ahead, neighbors, other_lane, sort_vehicles
 from limsim_jax.traffic.vehicles import BODY, PARAMETERS, Population, sample_vehicles
 from limsim_jax.types import Config, Driver, Egos, Lights, Queues, Scenario, Schedule, Shape, State
@@ -50,6 +52,9 @@ CHANGE_ROOM, CHANGE_TIME = 60.0, 6.0
 
 RARE = 1e-9
 """Chance per flow and lane that more vehicles arrive than the schedule has rows for; see `overflow`."""
+
+EGO_ROOM = 10.0
+"""m before and behind an ego that are free on its lane at the start."""
 
 AT_ONCE = 16
 """Departures that a decision looks at, at most."""
@@ -189,6 +194,28 @@ class Demand:
     arrivals: int = struct.field(pytree_node=False)  # drawn per stream
 
 
+@struct.dataclass(frozen=True, kw_only=True)
+class EgoStart:
+    """Where vehicles under test begin, `E` of them; they take the first slots.
+
+    Without a lane they take the places, goals and speeds of others that would be there at the start, so
+    every world has them elsewhere.
+    """
+
+    lane: Int[Array, " E"] | None = None
+    s: Float[Array, " E"] | None = None  # m, front bumper
+    goal: Int[Array, " E"] | None = None  # column of the route table
+    v: Float[Array, " E"] | None = None  # m/s, where road and leader allow it; None: as fast as they do
+    driver: Driver  # [E]
+    shape: Shape  # [E]
+    free: Bool[Array, " E"]  # moves in the plane, not on lanes
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return self.free.shape[0]
+
+
 def build_demand(
     network: Network,
     lane_map: LaneMap,
@@ -198,6 +225,7 @@ def build_demand(
     *,
     horizon: float,
     density: float = 0.0,
+    egos: EgoStart | None = None,
 ) -> Demand:
     """Check flows and density, and lay them out for `sample_scenario`.
 
@@ -210,6 +238,7 @@ def build_demand(
       population: whom to draw from.
       horizon: s; nobody comes after it.
       density: vehicles at the start per km of lane outside junctions.
+      egos: vehicles under test; nobody else starts on top of them, nor within `EGO_ROOM` on their lanes.
 
     Raises:
       ValueError: an origin or goal that is not there or not reachable, a number that makes no sense, a
@@ -224,7 +253,7 @@ def build_demand(
     for i, flow in enumerate(flows):
         streams += _streams(world, flow, i, horizon)
     wanted = sum((s.rate * s.goals for s in streams), np.zeros(world.reachable.shape[1]))
-    arrays = _lay_out(world, streams) | _seats(world, density, wanted)
+    arrays = _lay_out(world, streams) | _seats(world, density, wanted, egos)
     return jax.tree.map(jnp.asarray, Demand(population=population, **arrays))
 
 
@@ -540,7 +569,9 @@ def _cumulative(shares: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(total >= total[..., -1:] * (1 - 1e-12), 1.0, total / total[..., -1:])
 
 
-def _seats(world: _World, density: float, wanted: NDArray[np.float64]) -> dict[str, Any]:
+def _seats(
+    world: _World, density: float, wanted: NDArray[np.float64], egos: EgoStart | None
+) -> dict[str, Any]:
     """Places for vehicles at the start, about twice as many as there are vehicles.
 
     `wanted` has the traffic to every goal: goals are drawn in these proportions, where it can be.
@@ -553,10 +584,10 @@ def _seats(world: _World, density: float, wanted: NDArray[np.float64]) -> dict[s
     if initial:
         least = world.lengths[1] + _CLEAR
         pitch = max(least, 500 / density)
-        row, s, slack = _places(world, lanes, pitch)
+        row, s, slack = _places(world, lanes, pitch, egos)
         while len(row) < 1.5 * initial and pitch > least:
             pitch = max(least, 0.85 * pitch)
-            row, s, slack = _places(world, lanes, pitch)
+            row, s, slack = _places(world, lanes, pitch, egos)
     if len(row) < initial:
         raise ValueError(
             f"density = {density:g} veh/km puts {initial} vehicles on the roads at the start, "
@@ -579,7 +610,7 @@ def _seats(world: _World, density: float, wanted: NDArray[np.float64]) -> dict[s
 
 
 def _places(
-    world: _World, lanes: list[Lane], pitch: float
+    world: _World, lanes: list[Lane], pitch: float, egos: EgoStart | None
 ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
     """Row, hindmost front bumper and room from there (m) of places `pitch` m apart.
 
@@ -596,7 +627,18 @@ def _places(
     useful = world.leaves_room(row, s + slack).any(1)
     useful &= (world.allowed[row] & _fits(world, lanes, row, s, slack) & (world.shares > 0)).any(1)
     row, s, slack = row[useful], s[useful], slack[useful]
-    apart = _apart(world, lanes, row, s, slack)
+    # egos come first, and of two places that touch the first is kept
+    taken = np.zeros((2, 0))
+    if egos is not None and egos.lane is not None:
+        taken = np.array([egos.lane, egos.s], float)
+    near = (row[:, None] == taken[0]) & (s[:, None] - longest < taken[1] + EGO_ROOM)
+    near &= (s + slack)[:, None] > taken[1] - longest - EGO_ROOM
+    row, s, slack = (x[~near.any(1)] for x in (row, s, slack))
+    count = taken.shape[1]
+    row = np.concatenate([taken[0].astype(int), row])
+    s, slack = np.concatenate([taken[1], s]), np.concatenate([np.zeros(count), slack])
+    apart = _apart(world, row, s, slack)
+    apart[:count] = False
     return row[apart], s[apart], slack[apart]
 
 
@@ -618,13 +660,12 @@ def _fits(
 
 def _apart(
     world: _World,
-    lanes: list[Lane],
     row: NDArray[np.int_],
     s: NDArray[np.float64],
     slack: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
     """Mask of places whose bodies, of any size and anywhere in their place, touch none of another place."""
-    by_row = {world.rows[lane.id]: lane for lane in lanes}
+    by_row = {world.rows[lane.id]: lane for lane in world.network.drivable_lanes()}
     lengths = np.linspace(*world.lengths, 3)
     share = np.linspace(0, 1, 3)
     # boxes of three lengths at three positions each; their centres
@@ -658,7 +699,9 @@ def _separations(a: Float[Array, "P 5"], b: Float[Array, "P 5"]) -> Float[Array,
 # --- on the device: a world from a seed --------------------------------------------------------------
 
 
-def sample_scenario(demand: Demand, lane_map: LaneMap, key: Key[Array, ""], slots: int) -> Scenario:
+def sample_scenario(
+    demand: Demand, lane_map: LaneMap, key: Key[Array, ""], slots: int, egos: EgoStart | None = None
+) -> Scenario:
     """Draw one world: who is there at the start, and who comes later.
 
     Args:
@@ -666,12 +709,17 @@ def sample_scenario(demand: Demand, lane_map: LaneMap, key: Key[Array, ""], slot
       lane_map: the one that the demand was built for.
       key: of the world.
       slots: number of vehicle slots `N`.
+      egos: the ones that the demand was built with; they are in slots 0 to `E - 1`.
 
     Raises:
       ValueError: more vehicles at the start than slots.
     """
-    if demand.initial > slots:
-        raise ValueError(f"{demand.initial} vehicles at the start do not fit into {slots} slots")
+    placed = egos is not None and egos.lane is not None
+    initial = demand.initial + (egos.count if egos is not None and placed else 0)
+    if egos is not None and initial < egos.count:
+        raise ValueError(f"{egos.count} egos cannot take the places of {initial} vehicles at the start")
+    if initial > slots:
+        raise ValueError(f"{initial} vehicles at the start do not fit into {slots} slots")
     time, lane, place, stream = _sample_queues(demand, key)
     seat, shift = _sample_seats(demand, key)
     # those of the queues first, then those in the seats
@@ -699,8 +747,25 @@ def sample_scenario(demand: Demand, lane_map: LaneMap, key: Key[Array, ""], slot
     schedule = Schedule(
         time=time, lane=lane, s=s, v=v, goal=goal, driver=driver, shape=shape, start=demand.start
     )
+    if egos is not None:
+        now = _with_egos(lane_map, egos, now)
     state = _start(demand, lane_map, slots, *now)
+    if egos is not None:
+        box = boxes(lane_map, state)
+        state = replace(state, egos=from_lane(lane_map, state, box, range(egos.count), egos.free))
     return Scenario(start=state, schedule=schedule)
+
+
+def _with_egos(lane_map: LaneMap, egos: EgoStart, others: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Driver, shape, lane, s, v and goal of who is there at the start, egos first."""
+    _, _, lane, s, _, goal = jax.tree.map(lambda x: x[: egos.count], others)
+    rest = jax.tree.map(lambda x: x[egos.count :], others)
+    if egos.lane is not None and egos.s is not None and egos.goal is not None:
+        lane, s, goal, rest = egos.lane, egos.s, egos.goal, others
+    v = entry_speed(lane_map, egos.driver, lane, s, goal)
+    v = v if egos.v is None else jnp.minimum(egos.v, v)
+    them = egos.driver, egos.shape, lane, s, v, goal
+    return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), them, rest)
 
 
 def overflow(demand: Demand, key: Key[Array, ""]) -> Bool[Array, ""]:

@@ -329,7 +329,7 @@ def from_lane(
     state: State,
     box: Float[Array, "N 5"],
     slot: Sequence[int],
-    free: Sequence[bool] | bool,
+    free: Sequence[bool] | Bool[Array, " E"] | bool,
 ) -> Egos:
     """Egos in these slots, where `state` has them on lanes; `box`: `motion.boxes` of that state.
 

@@ -91,6 +91,9 @@ class Tick(NamedTuple):
     state: State
     left: Bool[Array, " N"]  # has left at the end of its goal in this step
     time: Float[Array, ""]  # s since the start, after the step
+    decision: Decision  # the one that this step follows
+    x: Float[Array, " N"]  # m travelled since then
+    dx: Float[Array, " N"]  # m of that in this step
 
 
 @jax.named_scope("decide")
@@ -145,6 +148,7 @@ def decide(
         ahead=distance,
         courtesy=choice.letting,
         courtesy_gap=choice.letting_gap,
+        way=ahead.lane,
     )
 
 
@@ -253,8 +257,9 @@ def drive(
         state, x = carry
         state = replace(state, **fixed)
         state, dx, left = _step(config, traffic, lane_map, state, decision, x, command)
-        out = None if record is None else record(Tick(state, left, config.time(state.step)))
-        return (bare(state), x + dx), out
+        x = x + dx
+        tick = Tick(state, left, config.time(state.step), decision, x, dx)
+        return (bare(state), x), None if record is None else record(tick)
 
     before, x = state, jnp.zeros_like(state.s)
     (state, _), records = lax.scan(step, (bare(state), x), None, length=config.decision_every)

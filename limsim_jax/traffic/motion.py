@@ -40,6 +40,7 @@ class Decision(NamedTuple):
     ahead: Float[Array, " N"]  # m to there, at the decision
     courtesy: Int[Array, " N"]  # slot of a vehicle that is let in, -1 for none
     courtesy_gap: Float[Array, " N"]  # m to it, at the decision
+    way: Int[Array, "N D"]  # lane and the lanes that it will drive on next
 
 
 COURTESY = 2.0

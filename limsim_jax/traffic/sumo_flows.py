@@ -25,7 +25,7 @@ class SumoScenario:
     """What comes of a SUMO demand: an empty road, and a schedule of those who enter."""
 
     lane_map: LaneMap
-    """With the ways of these vehicles as its `routes`."""
+    """With the ways of these vehicles as `routes`; its signal programs start where they are at `begin`."""
     scenario: Scenario
     vehicles: tuple[str, ...]
     """Ids of the vehicles in the rows of the schedule; those of a flow have its id and a number."""
@@ -53,7 +53,7 @@ def sumo_scenario(
 
     Args:
       network: the map.
-      lane_map: of that map; its routes are replaced.
+      lane_map: of that map; its routes are replaced, and the offsets of its signal programs moved.
       demand: from `maps.sumo_demand.read_demand`.
       slots: vehicle slots of the world.
       begin: time of the files at which the scenario starts, s; default: that of the first departure.
@@ -77,7 +77,9 @@ def sumo_scenario(
     if not placed:
         raise ValueError("the demand has no vehicle that departs: " + "; ".join(notes.lines()))
     placed.sort(key=lambda d: (d.row, d.time))
-    lane_map = replace(lane_map, routes=ways.table())
+    signals = lane_map.signals  # whose time is that of the files
+    signals = replace(signals, offset=jnp.mod(signals.offset - begin, signals.cycle))
+    lane_map = replace(lane_map, routes=ways.table(), signals=signals)
     types = list(dict.fromkeys(d.type for d in placed))
     scenario = _scenario(lane_map, demand, types, placed, begin, slots, seed)
     return SumoScenario(

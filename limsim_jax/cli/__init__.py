@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from limsim_jax import __version__
+from limsim_jax.cli import results
 
 if TYPE_CHECKING:
-    from limsim_jax.maps.lane_map import LaneMap
     from limsim_jax.maps.network import ImportReport, Network
-    from limsim_jax.rollout import Totals, Trace
+    from limsim_jax.rollout import Totals
 
 # XLA logs an error for every program that it loads from its own cache on a CPU; nothing is wrong.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -39,6 +39,7 @@ map_app = typer.Typer(help="Look at a map: OpenDRIVE (.xodr) or SUMO (.net.xml).
 bench_app = typer.Typer(help="Measure speed on this machine.", no_args_is_help=True)
 app.add_typer(map_app, name="map")
 app.add_typer(bench_app, name="bench")
+results.add_commands(app)
 
 MapArgument = Annotated[
     str, typer.Argument(metavar="FILE", help="Map file, gzipped or not, or the name of a bundled map.")
@@ -57,6 +58,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse(error.format_message())
     except MapError as error:
         return _refuse(str(error))
+    except ValueError as error:
+        if not _is_ours(error):
+            raise
+        return _refuse(str(error))
     except OSError as error:
         if error.filename is None:  # not about a file that the user named
             raise
@@ -68,6 +73,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (typer.Abort, KeyboardInterrupt):
         return 130
     return code or 0
+
+
+def _is_ours(error: ValueError) -> bool:
+    """Whether our own code has raised it, to tell the user what to do."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return trace is not None and str(trace.tb_frame.f_globals.get("__name__")).startswith("limsim_jax.")
 
 
 def _refuse(reason: str) -> int:
@@ -283,7 +296,9 @@ def run(
         _write_json(json_file, summary)
     _show(f"{Path(network.source).name}, {summary['seconds']:g} s, seed {seed}", arrivals, summary)
     if trace_file is not None:
-        _write_trace(trace_file, network, lane_map, result.trace)
+        from limsim_jax.cli.trace import write_trace
+
+        write_trace(trace_file, network, lane_map, result.trace)
     if picture is not None or video is not None:
         from limsim_jax.report.video import write_picture, write_video
 
@@ -456,43 +471,6 @@ def _table(lines: list[tuple[str, str]], title: str | None = None) -> None:
     console.print(table)
 
 
-def _write_trace(path: Path, network: Network, lane_map: LaneMap, trace: Trace) -> None:
-    """Every step as arrays (.npz) or one row per step and vehicle (.parquet); x, y as in the map file."""
-    import numpy as np
-
-    from limsim_jax.maps.lane_map import absolute, lane_ids
-
-    x, y = absolute(lane_map, trace.box[..., 0], trace.box[..., 1])
-    ids = np.array(lane_ids(network))
-    slot = np.broadcast_to(np.arange(trace.active.shape[1]), trace.active.shape)
-    columns = {
-        "time": np.broadcast_to(trace.time[:, None], trace.active.shape),
-        # those of the start have no row of the schedule: numbers below 0
-        "vehicle": np.where(trace.vehicle < 0, -1 - slot, trace.vehicle),
-        "slot": slot,
-        "lane": trace.lane,
-        **{name: getattr(trace, name) for name in ("s", "d", "v", "a")},
-        "x": x,
-        "y": y,
-        "heading": trace.box[..., 2],
-        "length": trace.box[..., 3],
-        "width": trace.box[..., 4],
-        "status": trace.status,
-    }
-    if path.suffix.lower() == ".npz":
-        arrays = columns | {"time": trace.time, "active": trace.active, "phase": trace.phase, "lane_ids": ids}
-        del arrays["slot"]
-        with path.open("wb") as file:
-            np.savez_compressed(file, **arrays)
-        return
-    import pyarrow  # pyright: ignore[reportMissingImports]
-    import pyarrow.parquet  # pyright: ignore[reportMissingImports]
-
-    rows = {name: np.ascontiguousarray(column[trace.active]) for name, column in columns.items()}
-    rows["lane"] = ids[rows["lane"]]
-    pyarrow.parquet.write_table(pyarrow.table(rows), path)
-
-
 def _path(file: str) -> Path:
     from limsim_jax.maps import bundled_map
 
@@ -554,7 +532,3 @@ def _window(text: str) -> tuple[float, float, float, float]:
 
 def _write_json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

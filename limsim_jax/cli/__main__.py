@@ -1,0 +1,8 @@
+"""`python -m limsim_jax.cli`."""
+
+import sys
+
+from limsim_jax.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,391 @@
+"""Commands about sweeps and their results: sweep, report, compare, verify, replay."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from limsim_jax.report.tables import TextTable
+    from limsim_jax.sweep.episode import Episodes
+    from limsim_jax.sweep.experiment import Experiment
+    from limsim_jax.sweep.runner import Progress
+    from limsim_jax.sweep.store import Results
+
+ExperimentArgument = Annotated[
+    str,
+    typer.Argument(metavar="EXPERIMENT", help="Experiment file (.toml), or the name of a bundled one."),
+]
+ResultsArgument = Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder that a sweep has written.")]
+ScenarioOption = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Scenario, where the results hold several.")
+]
+PolicyOption = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Policy, where the results hold several.")
+]
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    for command in (sweep, report, compare, verify, replay):
+        app.command()(command)
+
+
+def sweep(
+    experiment: ExperimentArgument,
+    seeds: Annotated[int, typer.Option(help="How many worlds of each scenario: seeds 0, 1, 2, ...")] = 100,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where results go.  [default: results/EXPERIMENT]"),
+    ] = None,
+    policy: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Drive the ego by this policy instead."),
+    ] = None,
+    map_file: Annotated[
+        str | None, typer.Option("--map", metavar="MAP", help="Use this map, not that of the file.")
+    ] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="I/N", help="Run one of N parts, from 0/N on: for job arrays.")
+    ] = None,
+    until_ci: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WIDTH[:METRIC]",
+            help="Stop once the interval of the metric (default: success) is within +- WIDTH.",
+        ),
+    ] = None,
+    chunk: Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Run on so many Ray workers (needs the extra 'ray').")
+    ] = None,
+    address: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Ray cluster.  [default: this machine]")
+    ] = None,
+    html: Annotated[bool, typer.Option("--report/--no-report", help="Write the report at the end.")] = True,
+) -> None:
+    """Run an experiment with many seeds; go on where an earlier run has stopped."""
+    from limsim_jax.sweep.experiment import read_experiments
+
+    part, stop = _shard(shard), _until(until_ci)
+    if seeds < 1:
+        raise typer.BadParameter(f"{seeds}; at least 1", param_hint="--seeds")
+    if chunk is not None and chunk < 1:
+        raise typer.BadParameter(f"{chunk}; at least 1", param_hint="--chunk")
+    if workers is not None and workers < 1:
+        raise typer.BadParameter(f"{workers}; at least 1", param_hint="--workers")
+    experiments = read_experiments(experiment, map_file=map_file, policy=policy)
+    folder = Path("results") / Path(experiment).stem if out is None else out
+    begin = time.perf_counter()
+
+    from limsim_jax.sweep import runner
+
+    with _bar() as show:
+        if workers is not None:
+            from limsim_jax.sweep.cluster import sweep_on_ray
+
+            factory = functools.partial(build, experiments, chunk, cores=1)
+            summary = sweep_on_ray(
+                factory, range(seeds), folder, workers=workers, address=address, shard=part, until_ci=stop,
+                progress=show,
+            )  # fmt: skip
+        else:
+            summary = runner.sweep(
+                build(experiments, chunk), range(seeds), folder, shard=part, until_ci=stop, progress=show
+            )
+    ran = sum(found.ran for found in summary.parts)
+    for line in summary.damaged:
+        print(f"set aside and run again: {line}")
+    for found in summary.parts:
+        if stop is not None and found.interval is not None:
+            low, high = found.interval.low, found.interval.high
+            state = "reached" if found.reached else "not reached"
+            where = f"{stop[1]} within [{low:.4g}, {high:.4g}]"
+            print(f"{found.scenario}: {where} after {found.done} seeds, {state}")
+    print(f"{ran} worlds run in {time.perf_counter() - begin:.0f} s, results in {folder}")
+    if part is None:
+        _print_headline(folder)
+        if html:
+            _write_report(folder, folder / "report.html", worst=3)
+
+
+def report(
+    results: ResultsArgument,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Page to write.  [default: RESULTS/report.html]")
+    ] = None,
+    worst: Annotated[int, typer.Option(min=0, help="Worst episodes to show with pictures and replays.")] = 6,
+    csv: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the tables as CSV, too.")] = None,
+) -> None:
+    """Print the main metrics with intervals, and write a page with plots and the worst episodes."""
+    _print_headline(results)
+    if csv is not None:
+        from limsim_jax.report.tables import write_csv
+        from limsim_jax.sweep.store import open_results
+
+        for path in write_csv(open_results(results), csv):
+            print(f"wrote {path}")
+    _write_report(results, results / "report.html" if out is None else out, worst)
+
+
+def compare(
+    a: Annotated[Path, typer.Argument(metavar="A", help="Results.")],
+    b: Annotated[
+        Path | None, typer.Argument(metavar="[B]", help="Other results; without, two policies of A.")
+    ] = None,
+    policies: Annotated[
+        str | None, typer.Option(metavar="P,Q", help="Compare policy P of A with Q of B.")
+    ] = None,
+    rows: Annotated[int, typer.Option(min=1, help="Print so many rows, those with most evidence.")] = 25,
+    csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all rows as CSV.")] = None,
+) -> None:
+    """Compare B with A seed by seed: equal seeds are equal traffic."""
+    from limsim_jax.report.compare import compare as compare_results
+    from limsim_jax.report.compare import comparison_text
+    from limsim_jax.sweep.store import open_results
+
+    pair: tuple[str, str] | None = None
+    if policies is not None:
+        first, comma, second = policies.partition(",")
+        if not (first and comma and second) or "," in second:
+            raise typer.BadParameter(f"'{policies}'; as like_traffic,mine", param_hint="--policies")
+        pair = first, second
+    found = compare_results(open_results(a), None if b is None else open_results(b), policies=pair)
+    _print_table(comparison_text(found, rows))
+    if csv is not None:
+        from pyarrow import csv as writer
+
+        writer.write_csv(found.table, csv)
+        print(f"wrote {csv}")
+
+
+def verify(
+    results: ResultsArgument,
+    sample: Annotated[int, typer.Option(min=1, help="Worlds of each scenario to run again.")] = 16,
+    seed: Annotated[int, typer.Option(help="Of the choice.")] = 0,
+) -> None:
+    """Run a random sample of stored worlds again, and compare every number and the final state."""
+    from limsim_jax.sweep.runner import verify as verify_results
+    from limsim_jax.sweep.store import open_results
+
+    opened = open_results(results)
+    groups = list(opened.provenance)
+    found = verify_results(opened, [_rebuild(opened, *group) for group in groups], sample, seed)
+    for line in found.differences:
+        print(f"made differently: {line}")
+    for miss in found.mismatches:
+        print(f"differs: {miss.scenario}/{miss.policy} seed {miss.seed}: {miss.what}")
+    print(f"{found.checked} worlds run again, {len(found.mismatches)} differ")
+    if not found.ok:
+        raise typer.Exit(1)
+
+
+def replay(
+    results: ResultsArgument,
+    seed: Annotated[int, typer.Option(help="Which world.")],
+    scenario: ScenarioOption = None,
+    policy: PolicyOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write .html (viewer), .gif or .mp4 (video), .png (the end), .parquet or .npz (every step)."
+            "  [default: RESULTS/replays/SCENARIO-POLICY-SEED.html]",
+        ),
+    ] = None,
+) -> None:
+    """Run one world of the results again and show it."""
+    from limsim_jax.sweep.store import open_results
+
+    opened = open_results(results)
+    group = _group(opened, scenario, policy)
+    path = results / "replays" / f"{group[0]}-{group[1]}-{seed}.html" if out is None else out
+    if path.suffix not in (".html", ".gif", ".mp4", ".png", ".parquet", ".npz"):
+        raise typer.BadParameter(
+            f"'{path}': use .html, .gif, .mp4, .png, .parquet or .npz", param_hint="--out"
+        )
+    if not 0 <= seed < 2**31:
+        raise typer.BadParameter(f"{seed}; it has to be within 0 and 2^31 - 1", param_hint="--seed")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    network, lane_map, trace, ego, moments, metrics = _rebuild(opened, *group).replay(seed)
+    for row in moments:
+        value = "" if math.isnan(row["value"]) else f", {row['value']:.2f}"
+        who = f", responsible: {row['responsible']}" if row["responsible"] else ""
+        print(f"{row['time']:6.1f} s  {row['kind']}{value}{who}")
+    stored = _stored(opened, group, seed)
+    if stored is not None and (differs := [x for x in metrics if not _alike(metrics[x], stored[x])]):
+        print(f"note: not the episode that is stored: {', '.join(differs[:3])} differ; 'verify' may tell why")
+    match path.suffix:
+        case ".html":
+            from limsim_jax.report.viewer import write_viewer
+
+            write_viewer(
+                path, network, lane_map, trace, ego=ego, moments=moments, title=f"{group[0]}, seed {seed}"
+            )
+        case ".gif" | ".mp4":
+            from limsim_jax.report.video import write_video
+
+            write_video(path, network, lane_map, trace)
+        case ".png":
+            from limsim_jax.report.video import write_picture
+
+            write_picture(path, network, lane_map, trace)
+        case _:
+            from limsim_jax.cli.trace import write_trace
+
+            write_trace(path, network, lane_map, trace)
+    print(f"wrote {path}")
+
+
+# --- helpers -----------------------------------------------------------------------------------------
+
+
+def build(
+    experiments: Sequence[Experiment], chunk: int | None = None, cores: int | None = None
+) -> list[Episodes]:
+    """Episodes of experiments, on all cores or so many."""
+    from limsim_jax.rollout import use_all_cores
+    from limsim_jax.sweep.episode import Episodes
+
+    with contextlib.suppress(RuntimeError):  # the backend runs already
+        use_all_cores(cores)
+    return [Episodes(one, chunk=chunk) for one in experiments]
+
+
+def _rebuild(results: Results, scenario: str, policy: str) -> Episodes:
+    """Episodes as they were when the results were made."""
+    from limsim_jax.sweep.experiment import Experiment
+
+    stored = results.provenance[scenario, policy]
+    experiment = Experiment.model_validate(stored["experiment"] | {"map": stored["map_file"]})
+    (episodes,) = build([experiment], stored["chunk"])
+    return episodes
+
+
+def _group(results: Results, scenario: str | None, policy: str | None) -> tuple[str, str]:
+    """The one scenario and policy that are meant."""
+    groups = list(results.provenance)
+    fits = [(s, p) for s, p in groups if scenario in (None, s) and policy in (None, p)]
+    if len(fits) != 1:
+        known = ", ".join(f"{s} ({p})" for s, p in groups)
+        wanted = "name one with --scenario and --policy" if fits else "there is no such one"
+        raise typer.BadParameter(f"{wanted}; the results hold {known}", param_hint="--scenario")
+    return fits[0]
+
+
+def _stored(results: Results, group: tuple[str, str], seed: int) -> dict[str, Any] | None:
+    """The row of a seed, if there is one."""
+    import pyarrow.compute as pc
+
+    table = results.episodes
+    wanted = (
+        (pc.field("scenario") == group[0]) & (pc.field("policy") == group[1]) & (pc.field("seed") == seed)
+    )
+    rows = table.filter(wanted).to_pylist()
+    return rows[0] if rows else None
+
+
+def _alike(value: float, stored: float | None) -> bool:
+    """Equal but for rounding: a program that keeps every step may round otherwise."""
+    return math.isnan(value) if stored is None else math.isclose(value, stored, rel_tol=1e-3, abs_tol=1e-4)
+
+
+def _shard(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    first, slash, second = text.partition("/")
+    if not (slash and first.isdecimal() and second.isdecimal()) or int(first) >= int(second):
+        raise typer.BadParameter(f"'{text}'; as 0/4, 1/4, 2/4, 3/4", param_hint="--shard")
+    return int(first), int(second)
+
+
+def _until(text: str | None) -> tuple[float, str] | None:
+    if text is None:
+        return None
+    width, _, metric = text.partition(":")
+    try:
+        return float(width), metric or "success"
+    except ValueError:
+        raise typer.BadParameter(f"'{text}'; as 0.02 or 0.5:mean_speed", param_hint="--until-ci") from None
+
+
+@contextlib.contextmanager
+def _bar() -> Iterator[Callable[[Progress], None]]:
+    """A progress bar; without a terminal a line when a scenario is finished."""
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    console = Console()
+    with rich_progress.Progress(
+        rich_progress.TextColumn("{task.description:<28}"),
+        rich_progress.BarColumn(bar_width=24),
+        rich_progress.TextColumn("{task.completed:.0f}/{task.total:.0f} worlds  {task.fields[said]}"),
+        console=console,
+        disable=not console.is_terminal,
+    ) as bar:
+        tasks: dict[tuple[str, str], Any] = {}
+
+        def show(now: Progress) -> None:
+            key = now.scenario, now.policy
+            if key not in tasks:
+                tasks[key] = bar.add_task(f"{now.scenario} / {now.policy}", total=now.wanted, said="")
+            said = f"{now.km:,.0f} km  {now.contacts:.0f} contacts"
+            if now.stage == "compiling":
+                said = "compiling"
+            elif not math.isnan(now.eta) and now.stage == "running":
+                said += f"  {now.eta:.0f} s left"
+            bar.update(tasks[key], completed=now.done, said=said)
+            if now.stage == "finished" and not console.is_terminal:
+                print(f"{now.scenario} / {now.policy}: {now.done} of {now.wanted} worlds, {said}, "
+                      f"{now.elapsed:.0f} s", flush=True)  # fmt: skip
+
+        yield show
+
+
+def _print_headline(results: Path) -> None:
+    from limsim_jax.report.tables import headline
+    from limsim_jax.sweep.store import open_results
+
+    _print_table(headline(open_results(results)))
+
+
+def _print_table(table: TextTable) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for k, name in enumerate(table.header):
+        shown.add_column(name, justify="left" if k == 0 else "right", no_wrap=k == 0)
+    for row in table.rows:
+        shown.add_row(*row)
+    if not console.is_terminal:
+        console.width = 200
+    console.print(shown)
+    for note in table.notes:
+        print(note)
+
+
+def _write_report(results: Path, path: Path, worst: int) -> None:
+    from limsim_jax.report.page import write_report
+    from limsim_jax.sweep.store import open_results
+
+    opened = open_results(results)
+
+    @functools.cache
+    def episodes(scenario: str, policy: str) -> Episodes:
+        return _rebuild(opened, scenario, policy)
+
+    def again(scenario: str, policy: str, seed: int) -> tuple[Any, ...]:
+        return episodes(scenario, policy).replay(seed)
+
+    write_report(opened, path, replayer=again, worst=worst, say=print)
+    print(f"wrote {path}")

@@ -1,0 +1,69 @@
+"""Policies to compare others with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from limsim_jax.maps.lane_map import LaneMap, pose
+from limsim_jax.traffic.ego import Control
+from limsim_jax.traffic.engine import Command
+from limsim_jax.types import Config, State
+
+
+@dataclass(frozen=True)
+class ConstantSpeed:
+    """Steers along its route at one speed and minds nobody: how dangerous is it not to look?
+
+    Steering by the pure-pursuit law (Coulter 1992, CMU-RI-TR-92-01): the arc through the point of the lane
+    `look_ahead` s ahead.
+
+    Attributes:
+      speed: m/s; None: the one that it starts with.
+      look_ahead: s.
+    """
+
+    speed: float | None = None
+    look_ahead: float = 0.8
+
+    free = True
+
+    def __post_init__(self) -> None:
+        if self.speed is not None and not self.speed >= 0:
+            raise ValueError(f"speed: {self.speed} m/s; it has to be 0 or more")
+        if not self.look_ahead > 0:
+            raise ValueError(f"look_ahead: {self.look_ahead} s; it has to be above 0")
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """The speed to keep."""
+        del config, lane_map
+        v = state.v[state.egos.slot]
+        return v if self.speed is None else jnp.full_like(v, self.speed)
+
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
+    ) -> tuple[Command, Any]:
+        """Steer to the point ahead, hold the speed."""
+        del key
+        egos, slot = state.egos, state.egos.slot
+        wheelbase = state.shape.wheelbase[slot]
+        v, lane, goal = state.v[slot], state.lane[slot], state.goal[slot]
+        reach = jnp.maximum(self.look_ahead * v, 4.0)
+        # the place ahead along the route, two lane ends deep
+        there, s = lane, state.s[slot] - state.shape.length[slot] / 2 + reach
+        for _ in range(2):
+            after = lane_map.routes.next_lane[there, goal]
+            beyond = (s > lane_map.length[there]) & (after >= 0)
+            s = jnp.where(beyond, s - lane_map.length[there], s)
+            there = jnp.where(beyond, after, there)
+        x, y, _ = pose(lane_map, there, s)
+        cos, sin = jnp.cos(egos.heading), jnp.sin(egos.heading)
+        dx, dy = x - (egos.x - wheelbase / 2 * cos), y - (egos.y - wheelbase / 2 * sin)
+        across = cos * dy - sin * dx
+        bend = 2 * across / jnp.maximum(dx * dx + dy * dy, 1.0)
+        steering = jnp.arctan(wheelbase * bend)
+        wish = (memory - v) / config.decision_time
+        return Command(control=Control(acceleration=wish, steering=steering)), memory

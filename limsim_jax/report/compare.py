@@ -1,0 +1,284 @@
+"""Two policies, or two versions, on the same seeds: differences seed by seed.
+
+A seed draws the same traffic whatever drives the ego (common random numbers), so that what the traffic does
+to a metric cancels in the difference of two rows. Means: BCa bootstrap of the differences, and the paired
+t-test. Shares: the same interval, and McNemar's test (1947) in its exact form, on the seeds in which one
+succeeds and the other does not. p-values of one comparison are adjusted together by Holm (1979).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from limsim_jax.report.tables import (
+    Group,
+    TextTable,
+    better,
+    columns,
+    groups,
+    kind_of,
+    mean_intervals,
+    metrics_of,
+    null,
+    number_text,
+    with_shares,
+)
+
+if TYPE_CHECKING:
+    from limsim_jax.sweep.store import Results
+
+Floats = NDArray[np.float64]
+
+_UNDER_TEST = {"name", "description", "ego.policy", "ego.options", "ego.driver"}
+_VERSION = ("version", "source", "platform", "machine", "jax", "jaxlib")
+
+_SCHEMA = pa.schema(
+    [
+        *((name, pa.string()) for name in ("scenario", "policy_a", "policy_b", "metric", "meaning", "kind")),
+        *((name, pa.int64()) for name in ("pairs", "measured_a_only", "measured_b_only")),
+        *((name, pa.float64()) for name in ("mean_a", "mean_b", "difference", "lower", "upper")),
+        *((name, pa.int64()) for name in ("a_not_b", "b_not_a")),
+        *((name, pa.float64()) for name in ("p", "p_adjusted")),
+        ("better", pa.string()),
+    ]
+)
+
+
+class Comparison(NamedTuple):
+    """What differs between A and B.
+
+    `table` has a row per scenario and metric, the strongest evidence first: scenario, policy_a, policy_b,
+    metric, meaning, kind ("mean", "proportion"), pairs (seeds in which both measured it), measured_a_only,
+    measured_b_only (seeds left out), mean_a and mean_b over the pairs, difference (B - A) with lower and
+    upper, for proportions a_not_b and b_not_a (seeds with 1 in one only), p, p_adjusted (over all rows), and
+    better: "A", "B", or null where neither more nor less is better or the evidence is weak (p_adjusted
+    above 1 - level).
+    """
+
+    table: pa.Table
+    notes: list[str]
+
+
+def compare(
+    a: Results,
+    b: Results | None = None,
+    *,
+    policies: tuple[str, str] | None = None,
+    level: float = 0.95,
+) -> Comparison:
+    """Compare B with A, seed by seed, in every scenario that both have.
+
+    Args:
+      a: results.
+      b: other results; without them, two policies of `a`.
+      policies: of A and of B. By default those of the same name, or where each has one only, that one.
+      level: of the intervals.
+
+    Raises:
+      ValueError: nothing in common, or another map, demand or rule in A than in B; one line that names it.
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"the level must lie between 0 and 1, not {level!r}; 95 % is 0.95")
+    b = a if b is None else b
+    parts_a, parts_b = groups(a), groups(b)
+    pairs = _pairs(a, b, parts_a, parts_b, policies)
+    rows: list[dict[str, Any]] = []
+    notes: list[str] = []
+    for first, second in pairs:
+        _check_same_world(a, b, first, second)
+        notes += _version_notes(a.provenance.get(first, {}), b.provenance.get(second, {}), first[0])
+        found, said = _compared(a, b, parts_a[first], parts_b[second], first, second, level)
+        rows += found
+        notes += said
+    for row, p in zip(rows, _holm([row["p"] for row in rows]), strict=True):
+        row["p_adjusted"] = p
+        sign = better(row["metric"]) * float(np.sign(row["difference"]))
+        row["better"] = {1: "B", -1: "A"}.get(int(sign)) if p <= 1 - level else None
+    rows.sort(key=lambda row: (row["p"], -row.pop("strength")))
+    left_out = sorted({s for s, _ in (*parts_a, *parts_b)} - {first[0] for first, _ in pairs})
+    if left_out:
+        notes.append(f"not in both, left out: {', '.join(left_out)}")
+    clean = [{name: null(value) for name, value in row.items()} for row in rows]
+    return Comparison(pa.Table.from_pylist(clean, _SCHEMA), list(dict.fromkeys(notes)))
+
+
+def comparison_text(comparison: Comparison, k: int = 25) -> TextTable:
+    """The k rows with the strongest evidence, as text."""
+    rows = comparison.table.slice(0, k).to_pylist()
+    scenarios = {row["scenario"] for row in comparison.table.select(["scenario"]).to_pylist()}
+    several = len(scenarios) > 1
+    header = ["scenario"] * several + ["metric", "A", "B", "B - A", "seeds", "p", "p adjusted", "better"]
+    lines = []
+    for row in rows:
+        seeds = f"{row['pairs']:,}"
+        if row["a_not_b"] is not None:
+            seeds += f" ({row['a_not_b']:,} A only, {row['b_not_a']:,} B only)"
+        numbers = [f"{row[name]:.4g}" for name in ("mean_a", "mean_b")]
+        difference = number_text(row["difference"], row["lower"], row["upper"])
+        tests = [_p_text(row[name]) for name in ("p", "p_adjusted")]
+        scenario = [row["scenario"]] * several
+        lines.append([*scenario, row["metric"], *numbers, difference, seeds, *tests, row["better"] or ""])
+    rest = comparison.table.num_rows - len(rows)
+    notes = [*comparison.notes, "better: only where p, adjusted for the number of rows (Holm), is small"]
+    notes += [f"{rest:,} rows with less evidence are not shown"] if rest else []
+    return TextTable(header, lines, notes)
+
+
+def _p_text(p: float) -> str:
+    return "<0.0001" if p < 1e-4 else f"{p:.4f}"
+
+
+def _pairs(
+    a: Results,
+    b: Results,
+    parts_a: Mapping[Group, pa.Table],
+    parts_b: Mapping[Group, pa.Table],
+    policies: tuple[str, str] | None,
+) -> list[tuple[Group, Group]]:
+    same = a is b or a.path == b.path
+    own = {s: [p for scenario, p in parts_a if scenario == s] for s, _ in parts_a}
+    others = {s: [p for scenario, p in parts_b if scenario == s] for s, _ in parts_b}
+    common = [scenario for scenario in own if scenario in others]
+    if not common:
+        raise ValueError(
+            f"no scenario in common: {a.path} has {', '.join(own)}; {b.path} has {', '.join(others)}"
+        )
+    pairs: list[tuple[Group, Group]] = []
+    for s in common:
+        if policies is not None:
+            chosen = [policies] if policies[0] in own[s] and policies[1] in others[s] else []
+        elif same:
+            chosen = [(own[s][0], own[s][1])] if len(own[s]) == 2 else []
+        elif len(own[s]) == len(others[s]) == 1:
+            chosen = [(own[s][0], others[s][0])]
+        else:
+            chosen = [(p, p) for p in own[s] if p in others[s]]
+        pairs += [((s, first), (s, second)) for first, second in chosen]
+    if not pairs:
+        wanted = f"policies {policies[0]} and {policies[1]}" if policies else "no pair of policies"
+        known = ", ".join(sorted({p for some in (*own.values(), *others.values()) for p in some}))
+        raise ValueError(f"{wanted} to compare in {a.path} and {b.path}; name two of {known}")
+    return pairs
+
+
+def _check_same_world(a: Results, b: Results, first: Group, second: Group) -> None:
+    """The same seed must be the same world, judged alike."""
+    here, there = a.provenance.get(first, {}), b.provenance.get(second, {})
+    for part in ("map", "experiment"):
+        own, other = _flat(here.get(part)), _flat(there.get(part))
+        if part == "map" and "hash" in own and "hash" in other:
+            own, other = {"hash": own["hash"]}, {"hash": other["hash"]}
+        for field in sorted(own.keys() | other.keys()):
+            free = part == "experiment" and any(f"{field}.".startswith(f"{name}.") for name in _UNDER_TEST)
+            if not free and own.get(field) != other.get(field):
+                name = ".".join(filter(None, (part, field)))
+                raise ValueError(
+                    f"{first[0]}: the same seed is not the same world: {name} is {_short(own.get(field))} in "
+                    f"{a.path} ({first[1]}) and {_short(other.get(field))} in {b.path} ({second[1]})"
+                )
+
+
+def _flat(value: Any, name: str = "") -> dict[str, Any]:
+    """A tree as dotted names to leaves."""
+    if not isinstance(value, Mapping):
+        return {} if value is None and not name else {name: value}
+    found: dict[str, Any] = {}
+    for key, inner in value.items():
+        found |= _flat(inner, f"{name}.{key}" if name else str(key))
+    return found
+
+
+def _short(value: Any) -> str:
+    text = "not set" if value is None else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _version_notes(here: Mapping[str, Any], there: Mapping[str, Any], scenario: str) -> list[str]:
+    differ = [name for name in _VERSION if here.get(name) != there.get(name)]
+    if not differ:
+        return []
+    text = ", ".join(f"{name} {_short(here.get(name))} and {_short(there.get(name))}" for name in differ)
+    return [f"{scenario}: A and B were not made by the same program: {text}"]
+
+
+def _compared(
+    a: Results, b: Results, part_a: pa.Table, part_b: pa.Table, first: Group, second: Group, level: float
+) -> tuple[list[dict[str, Any]], list[str]]:
+    part_a, units = with_shares(part_a, a.units)
+    part_b, _ = with_shares(part_b, b.units)
+    seeds_a, seeds_b = (np.asarray(part["seed"].to_numpy()) for part in (part_a, part_b))
+    seeds, at_a, at_b = np.intersect1d(seeds_a, seeds_b, return_indices=True)
+    if not seeds.size:
+        raise ValueError(
+            f"{first[0]}: no seed in common: {seeds_a.min()} to {seeds_a.max()} in {a.path}, "
+            f"{seeds_b.min()} to {seeds_b.max()} in {b.path}"
+        )
+    where = f"{first[0]}: {seeds.size:,} seeds in both"
+    notes = []
+    alone = (len(seeds_a) - seeds.size, len(seeds_b) - seeds.size)
+    if any(alone):
+        notes.append(f"{where}; left out {alone[0]:,} only in A and {alone[1]:,} only in B")
+    same = int(np.sum(part_a["digest"].to_numpy()[at_a] == part_b["digest"].to_numpy()[at_b]))
+    if same:
+        notes.append(f"{where}; in {same:,} of them the two episodes are the same, bit by bit")
+    common = [name for name in metrics_of(part_a) if name in part_b.column_names]
+    names = [name for name in common if kind_of(units.get(name, "")) != "label"]
+    x, y = columns(part_a, names)[at_a], columns(part_b, names)[at_b]
+    intervals = mean_intervals(y - x, level=level)
+    rows = []
+    for k, name in enumerate(names):
+        in_a, in_b = ~np.isnan(x[:, k]), ~np.isnan(y[:, k])
+        both = in_a & in_b
+        if not both.any():
+            continue
+        own, other = x[both, k], y[both, k]
+        meaning = units.get(name, "")
+        proportion = kind_of(meaning) == "proportion" and np.isin((own, other), (0, 1)).all()
+        row: dict[str, Any] = dict(scenario=first[0], policy_a=first[1], policy_b=second[1], metric=name)
+        row |= dict(meaning=meaning, kind="proportion" if proportion else "mean", pairs=own.size)
+        row |= dict(measured_a_only=int((in_a & ~in_b).sum()), measured_b_only=int((in_b & ~in_a).sum()))
+        row |= dict(mean_a=float(own.mean()), mean_b=float(other.mean()))
+        row |= dict(zip(("difference", "lower", "upper"), intervals[k], strict=True))
+        t, row["p"] = paired_t(other - own)
+        row["strength"] = abs(t)
+        if proportion:
+            lost, won = int((own > other).sum()), int((other > own).sum())
+            row |= dict(a_not_b=lost, b_not_a=won, p=mcnemar(lost, won))
+        rows.append(row)
+    return rows, notes
+
+
+def mcnemar(a_not_b: int, b_not_a: int) -> float:
+    """Two-sided exact p-value: the chance of a split at least as uneven if both ways were as likely."""
+    from scipy.special import bdtr
+
+    n = a_not_b + b_not_a
+    return min(1.0, 2 * float(bdtr(min(a_not_b, b_not_a), n, 0.5))) if n else 1.0
+
+
+def paired_t(differences: Floats) -> tuple[float, float]:
+    """t and the two-sided p-value of the paired t-test; 0 and 1 where there is no difference to test."""
+    from scipy.special import stdtr
+
+    n, mean = differences.size, float(differences.mean())
+    error = float(differences.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
+    if n < 2 or mean == 0:
+        return 0.0, 1.0
+    if error == 0:
+        return math.copysign(math.inf, mean), 0.0
+    t = mean / error
+    return t, 2 * float(stdtr(n - 1, -abs(t)))
+
+
+def _holm(p: list[float]) -> list[float]:
+    order = np.argsort(p, kind="stable")
+    factors = len(p) - np.arange(len(p))
+    adjusted = np.empty(len(p))
+    adjusted[order] = np.minimum(np.maximum.accumulate(np.asarray(p)[order] * factors), 1)
+    return adjusted.tolist()

@@ -1,0 +1,548 @@
+"""Tables of a sweep: every metric with its interval, a short list of the main ones, the worst seeds, CSV.
+
+The seed is the unit. Shares (metrics that are 0 or 1) have Wilson's interval; means have the BCa bootstrap
+(Efron 1987) over seeds, seeded, so that the same results give the same table; crashes per distance have
+the exact interval of a Poisson rate (Garwood 1936); medians have that of order statistics (Conover 1999,
+3.2). A metric that was not measured in an episode is null there: it is left out, and `measured` says of
+how many seeds the rest speaks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from limsim_jax.metrics.blame import Responsibility
+from limsim_jax.metrics.intervals import RESAMPLES, Interval, wilson, zero_event_bound
+
+if TYPE_CHECKING:
+    from limsim_jax.sweep.store import Results
+
+Floats = NDArray[np.float64]
+Kind = Literal["proportion", "mean", "label", "rate"]
+Group = tuple[str, str]
+"""Scenario and policy."""
+
+KEYS = ("scenario", "policy", "seed", "digest")
+"""Columns of episodes that are no metrics."""
+
+CRASH_RATE = "crashes_per_1000_km"
+AT_FAULT_RATE = "at_fault_crashes_per_1000_km"
+
+_BLOCK = 2**20  # resampled weights at a time: bounds the memory
+
+# Shares that follow from metrics: an episode counts once, however many bodies it touched.
+_SHARES = {
+    "had_contact": ("contacts", "1 if the ego touched another body"),
+    "had_at_fault_contact": ("at_fault_contacts", "1 if it did by its own fault by nuPlan's rules"),
+    "had_near_miss": ("near_misses", "1 if the TTC fell below 1.5 s and no contact came of it"),
+    "left_road": ("off_road", "1 if the ego was off the drivable area"),
+    "ran_red_light": ("red_lights", "1 if the ego crossed a stop line on red"),
+}
+_RATES = {
+    CRASH_RATE: ("contacts", "episodes with a contact, per 1,000 km that the ego drove"),
+    AT_FAULT_RATE: ("at_fault_contacts", "those by the ego's fault by nuPlan's rules, per 1,000 km"),
+}
+
+
+class Main(NamedTuple):
+    """A metric of the short list."""
+
+    metric: str
+    label: str
+    statistic: Literal["estimate", "median"] = "estimate"
+    unit: str = ""
+    scale: float = 1.0
+
+
+MAIN = (
+    Main("success", "success", unit="%", scale=100),
+    Main("completion", "route completed", unit="%", scale=100),
+    Main("had_contact", "episodes with a contact", unit="%", scale=100),
+    Main("had_at_fault_contact", "contacts at fault (nuPlan)", unit="%", scale=100),
+    Main(CRASH_RATE, "crashes per 1,000 km"),
+    Main("had_near_miss", "episodes with a near miss", unit="%", scale=100),
+    Main("left_road", "episodes off the road", unit="%", scale=100),
+    Main("ran_red_light", "episodes with a red light run", unit="%", scale=100),
+    Main("min_ttc", "least TTC, median", "median", "s"),
+    Main("nuplan_score", "nuPlan score", unit="of 1"),
+    Main("carla_score", "CARLA score", unit="of 100"),
+    Main("limsim_corrected_total", "LimSim score, corrected", unit="of 100"),
+    Main("mean_speed", "mean speed", unit="m/s"),
+    Main("traffic_collided", "vehicles that collided, per episode"),
+)
+"""The short list, in order."""
+
+
+def groups(results: Results) -> dict[Group, pa.Table]:
+    """Episodes of each (scenario, policy), in the order of the provenance, by seed.
+
+    Raises `ValueError` if there are none.
+    """
+    table = results.episodes
+    if not table.num_rows:
+        raise ValueError(f"{results.path} holds no finished episodes")
+    pairs = table.select(["scenario", "policy"]).group_by(["scenario", "policy"]).aggregate([])
+    found = {(row["scenario"], row["policy"]) for row in pairs.to_pylist()}
+    order = [group for group in results.provenance if group in found]
+    order += sorted(found - set(order))
+    parts = {}
+    for scenario, policy in order:
+        rows = (pc.field("scenario") == scenario) & (pc.field("policy") == policy)
+        parts[scenario, policy] = table.filter(rows).sort_by("seed")
+    return parts
+
+
+def columns(episodes: pa.Table, names: Sequence[str]) -> Floats:
+    """Columns as `[rows, names]`, NaN where not measured."""
+    values = np.full((episodes.num_rows, len(names)), np.nan)
+    for k, name in enumerate(names):
+        column = episodes[name].cast(pa.float64())
+        found = column.fill_null(math.nan).to_numpy()
+        values[:, k] = np.where(np.isfinite(found), found, np.nan)
+    return values
+
+
+def metrics_of(episodes: pa.Table) -> list[str]:
+    """Names of the metrics among the columns."""
+    return [name for name in episodes.column_names if name not in KEYS]
+
+
+def with_shares(episodes: pa.Table, units: Mapping[str, str]) -> tuple[pa.Table, dict[str, str]]:
+    """Episodes with the shares that follow from their metrics (`had_contact`, ...), and all units."""
+    units = dict(units)
+    for name, (source, meaning) in _SHARES.items():
+        if source in episodes.column_names and name not in episodes.column_names:
+            count = columns(episodes, [source])[:, 0]
+            happened = pa.array(np.where(np.isnan(count), np.nan, count > 0), from_pandas=True)
+            episodes = episodes.append_column(name, happened)
+            units[name] = meaning
+    return episodes, units
+
+
+def kind_of(meaning: str) -> Kind:
+    """What the description of a metric says that it is."""
+    if meaning.startswith(("1 if", "0 or 1")):
+        return "proportion"
+    if meaning.startswith(("blame.", "slot")):
+        return "label"
+    return "mean"
+
+
+def better(metric: str) -> int:
+    """1 if more of a metric is better, -1 if less is, 0 if neither."""
+    if metric.startswith("min_") and not metric.endswith("_time"):
+        return 1
+    if metric.startswith(("nuplan_", "carla_", "limsim_")):
+        return 1
+    if metric in _GOOD:
+        return 1
+    when = metric.endswith("_time") and metric not in ("completion_time", "traffic_mean_travel_time")
+    return 0 if when or metric in _NEUTRAL else -1
+
+
+_GOOD = {"arrived", "success", "completion", "progress", "mean_speed", "comfortable",
+         "traffic_mean_speed", "traffic_flow_per_hour", "traffic_left"}  # fmt: skip
+_NEUTRAL = {"duration", "distance", "contact_other", "contact_type", "contact_responsibility",
+            "max_acceleration", "traffic_entered", "traffic_distance", "traffic_vehicle_km",
+            "traffic_density_per_km", "traffic_trips", "traffic_time"}  # fmt: skip
+
+_SCHEMA = pa.schema(
+    [
+        ("scenario", pa.string()),
+        ("policy", pa.string()),
+        ("metric", pa.string()),
+        ("meaning", pa.string()),
+        ("kind", pa.string()),
+        ("seeds", pa.int64()),
+        ("measured", pa.int64()),
+        *((name, pa.float64()) for name in ("estimate", "lower", "upper", "bound", "minimum")),
+        *((name, pa.float64()) for name in ("median", "median_lower", "median_upper", "maximum")),
+    ]
+)
+
+
+def summary(results: Results, *, level: float = 0.95) -> pa.Table:
+    """One row per (scenario, policy, metric).
+
+    Columns: scenario, policy, metric, meaning, kind ("proportion", "mean", "rate"), seeds, measured
+    (seeds in which there was a value: the others are left out), estimate with lower and upper at
+    `level`, bound, minimum, median with median_lower and median_upper, maximum. What does not exist
+    is null. Metrics that are labels (a slot, a type) are not summarised.
+
+    `bound`: where nothing happened in any measured episode, the one-sided bound on the share of episodes
+    in which it does (1 - (1 - level)^(1/n)); for rates, on the rate. Where a 0/1 metric was 1 in all, how
+    low its share may be.
+
+    Raises `ValueError` for no episodes or a level outside (0, 1).
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"the level must lie between 0 and 1, not {level!r}; 95 % is 0.95")
+    rows: list[dict[str, Any]] = []
+    for (scenario, policy), part in groups(results).items():
+        part, units = with_shares(part, results.units)
+        names = [name for name in metrics_of(part) if kind_of(units.get(name, "")) != "label"]
+        values = columns(part, names)
+        kinds = [_kind(units.get(name, ""), values[:, k]) for k, name in enumerate(names)]
+        means = [k for k, kind in enumerate(kinds) if kind == "mean"]
+        intervals = dict(zip(means, mean_intervals(values[:, means], level=level), strict=True))
+        for k, (name, kind) in enumerate(zip(names, kinds, strict=True)):
+            x = values[:, k]
+            x = x[~np.isnan(x)]
+            row: dict[str, Any] = dict(scenario=scenario, policy=policy, metric=name, kind=kind)
+            row |= dict(meaning=units.get(name, ""), seeds=len(values), measured=x.size)
+            if x.size:
+                found = wilson(int(x.sum()), x.size, level) if kind == "proportion" else intervals[k]
+                row |= dict(zip(("estimate", "lower", "upper"), found, strict=True))
+                row["bound"] = _bound(x, kind, level)
+                low, high = median_interval(x, level)
+                row |= dict(minimum=x.min(), median=np.median(x), maximum=x.max())
+                row |= dict(median_lower=low, median_upper=high)
+            rows.append(row)
+        rows += [
+            dict(scenario=scenario, policy=policy, **row) for row in _rates(part, level) if row is not None
+        ]
+    clean = [{name: null(row.get(name)) for name in _SCHEMA.names} for row in rows]
+    return pa.Table.from_pylist(clean, _SCHEMA)
+
+
+def _kind(meaning: str, x: Floats) -> Kind:
+    kind = kind_of(meaning)
+    fits = np.isin(x[~np.isnan(x)], (0.0, 1.0)).all()
+    return "mean" if kind == "proportion" and not fits else kind
+
+
+def null(value: Any) -> Any:
+    """None for NaN."""
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _bound(x: Floats, kind: str, level: float) -> float | None:
+    if not x.any():
+        return zero_event_bound(x.size, level)
+    if kind == "proportion" and x.all():
+        return 1 - zero_event_bound(x.size, level)
+    return None
+
+
+def _rates(part: pa.Table, level: float) -> list[dict[str, Any]]:
+    rows = []
+    for name, (source, meaning) in _RATES.items():
+        if not {source, "distance"} <= set(part.column_names):
+            continue
+        events, distance = columns(part, [source, "distance"]).T
+        measured = ~np.isnan(events) & ~np.isnan(distance)
+        row: dict[str, Any] = dict(metric=name, meaning=meaning, kind="rate")
+        row |= dict(seeds=len(events), measured=int(measured.sum()))
+        thousands = float(distance[measured].sum()) / 1e6
+        if thousands > 0:
+            count = int((events[measured] > 0).sum())
+            row |= dict(zip(("estimate", "lower", "upper"), poisson(count, thousands, level), strict=True))
+            row["bound"] = -math.log1p(-level) / thousands if count == 0 else None
+        rows.append(row)
+    return rows
+
+
+def poisson(events: int, exposure: float, level: float = 0.95) -> Interval:
+    """Events per unit of exposure, with the exact interval. Raises `ValueError` for no exposure."""
+    from scipy.special import gammaincinv
+
+    if events < 0 or not (exposure > 0 and math.isfinite(exposure)):
+        raise ValueError(f"{events} events in {exposure:g}? an exposure must be above 0")
+    tail = (1 - level) / 2
+    low = float(gammaincinv(events, tail)) if events else 0.0
+    return Interval(events / exposure, low / exposure, float(gammaincinv(events + 1, 1 - tail)) / exposure)
+
+
+def median_interval(values: Floats, level: float = 0.95) -> tuple[float, float]:
+    """Bounds of the median from order statistics; NaN where the values are too few for the level."""
+    from scipy.special import bdtr
+
+    x = np.sort(values)
+    n = x.size
+    # the most that may be cut at each end: P(Binomial(n, 1/2) < rank) <= (1 - level) / 2
+    ranks = np.arange(n // 2 + 1)
+    rank = int(np.sum(bdtr(ranks, n, 0.5) <= (1 - level) / 2))
+    if rank == 0:
+        return math.nan, math.nan
+    return float(x[rank - 1]), float(x[n - rank])
+
+
+def mean_intervals(
+    values: Floats, *, level: float = 0.95, resamples: int = RESAMPLES, seed: int = 0
+) -> list[Interval]:
+    """BCa bootstrap of the mean of each column of `[seeds, metrics]`; NaN is not measured.
+
+    Seeds are resampled, the same for all columns, so that a thousand columns cost little more than one.
+    As `metrics.intervals.bootstrap` otherwise: no width for equal values, no bounds (NaN) for a single
+    one, percentiles where no correction exists.
+    """
+    from scipy.special import ndtr, ndtri
+
+    m = values.shape[1]
+    there = ~np.isnan(values)
+    count = there.sum(0)
+    x = np.where(there, values, 0.0)
+    estimate = x.sum(0) / np.maximum(count, 1)
+    deviation = np.where(there, values - estimate, 0.0)
+    varied = (count > 1) & (np.where(there, values, -np.inf).max(0, initial=-np.inf)
+                            > np.where(there, values, np.inf).min(0, initial=np.inf))  # fmt: skip
+    some = np.flatnonzero(varied)
+    means = _resampled(deviation[:, some], there[:, some], resamples, seed)
+    z = float(ndtri((1 + level) / 2))
+    found = []
+    for k in range(m):
+        if count[k] < 2 or not varied[k]:
+            bounds = (estimate[k], estimate[k]) if count[k] > 1 else (math.nan, math.nan)
+            found.append(Interval(float(estimate[k]) if count[k] else math.nan, *map(float, bounds)))
+            continue
+        sample = means[:, np.searchsorted(some, k)]
+        sample = sample[~np.isnan(sample)]
+        shift = float(ndtri(((sample < 0).mean() + (sample <= 0).mean()) / 2))
+        u = deviation[:, k]
+        skew = float((u**3).sum() / (6 * (u**2).sum() ** 1.5))
+        ends = [ndtr(shift + (shift + q) / (1 - skew * (shift + q))) for q in (-z, z)]
+        if not np.isfinite(ends).all():
+            ends = [(1 - level) / 2, (1 + level) / 2]
+        low, high = estimate[k] + np.quantile(sample, ends)
+        found.append(Interval(float(estimate[k]), float(low), float(high)))
+    return found
+
+
+def _resampled(x: Floats, there: NDArray[np.bool_], resamples: int, seed: int) -> Floats:
+    """Means of each column, `[resamples, metrics]`: counts of the draws times values, a block at a time."""
+    n, m = x.shape
+    means = np.empty((resamples, m))
+    if not m:
+        return means
+    rng = np.random.default_rng(seed)
+    complete = there.all(0)
+    block = max(1, min(resamples, _BLOCK // n))
+    for first in range(0, resamples, block):
+        rows = min(block, resamples - first)
+        drawn = rng.integers(0, n, (rows, n), np.int32) + n * np.arange(rows, dtype=np.int32)[:, None]
+        weight = np.bincount(drawn.ravel(), minlength=rows * n).reshape(rows, n).astype(np.float64)
+        number = np.full((rows, m), float(n))
+        number[:, ~complete] = weight @ there[:, ~complete].astype(np.float64)
+        means[first : first + rows] = (weight @ x) / np.where(number > 0, number, np.nan)
+    return means
+
+
+class TextTable(NamedTuple):
+    """A table to print."""
+
+    header: list[str]
+    rows: list[list[str]]
+    notes: list[str]
+
+
+def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = None) -> TextTable:
+    """The main metrics as text: a label, then "estimate [lower, upper]" for every (scenario, policy).
+
+    Rows without any value are left out. `table`: the summary, if there is one already.
+    """
+    found = lookup(summary(results, level=level) if table is None else table)
+    order = list(dict.fromkeys((scenario, policy) for scenario, policy, _ in found))
+    several = len({policy for _, policy in order}) > 1
+    header = ["", *(f"{scenario} / {policy}" if several else scenario for scenario, policy in order)]
+    rows = [["seeds", *(f"{max(r['seeds'] for g, r in found.items() if g[:2] == o):,}" for o in order)]]
+    for main in MAIN:
+        cells = [cell(main, found.get((*group, main.metric))) for group in order]
+        if any(cells):
+            label = f"{main.label}, {main.unit}" if main.unit else main.label
+            rows.append([label, *cells])
+    notes = [
+        f"Brackets: {100 * level:g} % intervals over seeds: Wilson for shares, BCa bootstrap for means, "
+        "exact for rates and medians."
+    ]
+    if any("(of " in text for row in rows for text in row):
+        notes.append("(of n): measured in n episodes only; the others are not in the number.")
+    if any("<" in text or ">" in text for row in rows for text in row):
+        notes.append(f"< or >: one-sided {100 * level:g} % bound where it happened in no episode, or in all.")
+    return TextTable(header, rows, notes)
+
+
+def lookup(table: pa.Table) -> dict[tuple[str, str, str], dict[str, Any]]:
+    """Rows of a summary by scenario, policy and metric."""
+    return {(row["scenario"], row["policy"], row["metric"]): row for row in table.to_pylist()}
+
+
+def cell(main: Main, row: Mapping[str, Any] | None) -> str:
+    """What the short list says of a row of the summary; empty if it was never measured."""
+    if row is None or not row["measured"] or row[main.statistic] is None:
+        return ""
+    prefix = "median_" if main.statistic == "median" else ""
+    low, high = row[f"{prefix}lower"], row[f"{prefix}upper"]
+    text = number_text(row[main.statistic], low, high, main.scale)
+    if row["bound"] is not None:
+        text += f" {bound_text(row, main.scale)}"
+    if row["measured"] < row["seeds"]:
+        text += f" (of {row['measured']:,})"
+    return text
+
+
+def bound_text(row: Mapping[str, Any], scale: float = 1.0) -> str:
+    """The one-sided bound of a row that has one."""
+    if row["kind"] == "mean":
+        return f"(more in < {100 * row['bound']:.2g} % of episodes)"
+    sign = ">" if row["kind"] == "proportion" and row["estimate"] else "<"
+    return f"{sign} {scale * row['bound']:.2g}"
+
+
+def number_text(value: float, low: float | None, high: float | None, scale: float = 1.0) -> str:
+    """A number with its bounds, with as many digits as the bounds are wide."""
+    if low is None or high is None:
+        return f"{scale * value:.3g}"
+    width = scale * (high - low)
+    if not width > 0:
+        return f"{scale * value:.4g}"
+    digits = min(max(1 - math.floor(math.log10(width)), 0), 6)
+    value, low, high = (round(scale * x, digits) + 0.0 for x in (value, low, high))
+    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+_WORST_SCHEMA = pa.schema(
+    [
+        ("place", pa.int64()),
+        ("scenario", pa.string()),
+        ("policy", pa.string()),
+        ("seed", pa.int64()),
+        ("metric", pa.float64()),
+        ("contact", pa.bool_()),
+        ("at_fault", pa.bool_()),
+        ("delta_v", pa.float64()),
+        ("min_ttc", pa.float64()),
+        ("left_road", pa.bool_()),
+        ("kind", pa.string()),
+        ("time", pa.float64()),
+        ("other", pa.int32()),
+        ("value", pa.float64()),
+        ("responsible", pa.string()),
+        ("module", pa.string()),
+        ("avoidable_by_ego", pa.bool_()),
+        ("avoidable_by_other", pa.bool_()),
+    ]
+)
+
+
+def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
+    """The k worst episodes of all scenarios and policies, the worst first.
+
+    By severity: contacts first, of them those at the ego's fault (by nuPlan's rules, or responsible alone
+    or with the other one), then by delta-v; then who left the road; then by the least TTC. With `metric`:
+    by its value, episodes without one left out.
+
+    Columns: place, scenario, policy, seed, metric (its value), contact, at_fault, delta_v (m/s), min_ttc
+    (s), left_road, and of the episode's worst moment kind, time (s), other (slot), value, responsible,
+    module, avoidable_by_ego, avoidable_by_other.
+
+    Raises `ValueError` for an unknown metric, or one of which neither more nor less is worse.
+    """
+    table, _ = with_shares(results.episodes, results.units)
+    if metric is not None:
+        known = metrics_of(table)
+        if metric not in known:
+            raise ValueError(f"no metric '{metric}' in {results.path}; there are {', '.join(known)}")
+        if not better(metric):
+            raise ValueError(f"neither more nor less of '{metric}' is worse; name another metric")
+    view = _severity(table)
+    seeds = table["seed"].to_numpy()
+    ranked = None if metric is None else columns(table, [metric])[:, 0]
+    if metric is None or ranked is None:
+        order = np.lexsort((seeds, view["min_ttc"], -view["left_road"], -view["delta_v"],
+                            -view["at_fault"], -view["contact"]))  # fmt: skip
+    else:
+        order = np.lexsort((seeds, better(metric) * ranked))
+        order = order[~np.isnan(ranked[order])]
+    order = order[: max(k, 0)]
+    chosen = table.select(["scenario", "policy", "seed"]).take(order).to_pylist()
+    moments = first_moments(results, [(r["scenario"], r["policy"], r["seed"]) for r in chosen])
+    rows = []
+    for place, (i, row) in enumerate(zip(order, chosen, strict=True), 1):
+        key = (row["scenario"], row["policy"], row["seed"])
+        row |= dict(place=place, metric=None if ranked is None else float(ranked[i]))
+        row |= {name: bool(view[name][i]) for name in ("contact", "at_fault", "left_road")}
+        row["delta_v"] = float(view["delta_v"][i]) if row["contact"] else None
+        row["min_ttc"] = float(view["min_ttc"][i]) if np.isfinite(view["min_ttc"][i]) else None
+        moment = moments.get(key, {})
+        row |= {name: moment.get(name) for name in _WORST_SCHEMA.names[10:]}
+        if row["time"] is None:
+            when = view["contact_time"][i] if row["contact"] else view["min_ttc_time"][i]
+            row["time"] = null(float(when))
+        if row["responsible"] is None and row["contact"]:
+            row["responsible"] = _RESPONSIBLE.get(int(view["responsible"][i]))
+        rows.append(row)
+    return pa.Table.from_pylist(rows, _WORST_SCHEMA)
+
+
+_RESPONSIBLE = {int(who): who.name.lower() for who in Responsibility if who is not Responsibility.NONE}
+
+
+def _severity(table: pa.Table) -> dict[str, NDArray[Any]]:
+    """Columns that the ranking needs, 0 (for TTC inf, for times NaN) where there is nothing."""
+
+    def read(name: str, otherwise: float) -> Floats:
+        if name not in table.column_names:
+            return np.full(table.num_rows, otherwise)
+        return np.nan_to_num(columns(table, [name])[:, 0], nan=otherwise)
+
+    responsible = read("contact_responsibility", 0)
+    involved = np.isin(responsible, (int(Responsibility.EGO), int(Responsibility.SHARED)))
+    contact = read("contacts", 0) > 0
+    return {
+        "contact": contact * 1.0,
+        "at_fault": (contact & (involved | (read("at_fault_contacts", 0) > 0))) * 1.0,
+        "delta_v": np.maximum(read("max_delta_v", 0), read("contact_delta_v", 0)) * contact,
+        "left_road": (read("off_road", 0) > 0) * 1.0,
+        "min_ttc": read("min_ttc", math.inf),
+        "contact_time": read("contact_time", math.nan),
+        "min_ttc_time": read("min_ttc_time", math.nan),
+        "responsible": responsible,
+    }
+
+
+def first_moments(
+    results: Results, episodes: Sequence[tuple[str, str, int]]
+) -> dict[tuple[str, str, int], dict[str, Any]]:
+    """The worst moment of each of these episodes that has one."""
+    moments = results.moments
+    if not episodes or not moments.num_rows:
+        return {}
+    wanted = set(episodes)
+    rows = moments.filter(pc.field("seed").isin(sorted({seed for *_, seed in wanted})))
+    found: dict[tuple[str, str, int], dict[str, Any]] = {}
+    for row in rows.sort_by([("rank", "descending")]).to_pylist():
+        key = (row["scenario"], row["policy"], row["seed"])
+        if key in wanted:
+            found[key] = row
+    return found
+
+
+def write_csv(results: Results, folder: str | Path, *, table: pa.Table | None = None) -> list[Path]:
+    """Write summary.csv, worst.csv (100), episodes.csv and moments.csv; returns their paths.
+
+    `table`: the summary, if there is one already. Raises `OSError` if they cannot be written.
+    """
+    from pyarrow.csv import write_csv as write
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    tables = {
+        "summary": summary(results) if table is None else table,
+        "worst": worst(results, k=100).drop_columns(["metric"]),
+        "episodes": results.episodes,
+        "moments": results.moments,
+    }
+    paths = []
+    for name, content in tables.items():
+        path = folder / f"{name}.csv"
+        write(content, str(path))
+        paths.append(path)
+    return paths

@@ -1,0 +1,1 @@
+"""Sweeps over seeds: `experiment` files, `episode`, `runner`, results on disk (`store`), `cluster`."""

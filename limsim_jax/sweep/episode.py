@@ -1,0 +1,452 @@
+"""An experiment as episodes: a seed in, a row of metrics out; thousands of them at once."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import math
+import os
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+import limsim_jax
+from limsim_jax.maps import build_lane_map, bundled_maps, load_map
+from limsim_jax.maps.lane_map import LaneMap, lane_rows
+from limsim_jax.maps.network import MapError, Network
+from limsim_jax.maps.routing import default_goals
+from limsim_jax.metrics.blame import Responsibility
+from limsim_jax.metrics.episode import NAMES
+from limsim_jax.metrics.observer import EvaluateEgo
+from limsim_jax.metrics.reductions import on_host
+from limsim_jax.metrics.safety import NEAR_MISS
+from limsim_jax.metrics.traffic import NAMES as TRAFFIC_NAMES
+from limsim_jax.policies import POLICIES
+from limsim_jax.policies.base import Policy
+from limsim_jax.rollout import Rollout, Trace, Worlds, trace
+from limsim_jax.sweep.experiment import Bounds, EgoTable, Experiment, ExperimentError
+from limsim_jax.sweep.store import Outcome
+from limsim_jax.traffic import car_following
+from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand, entries, sample_scenario
+from limsim_jax.traffic.engine import Traffic
+from limsim_jax.traffic.vehicles import default_population, fitting, sample_vehicles, uniform_population
+from limsim_jax.types import Config, Scenario
+
+HARD = 3.4
+"""m/s^2 of braking asked for by the leader (DRAC) from which it is a key moment."""
+
+LEAD_UP = 1.0
+"""s around a contact within which near misses and hard braking belong to it."""
+
+MOMENTS = ("contact", "off_road", "red_light", "near_miss", "hard_brake", "unsafe")
+"""Kinds of key moments, the worst first."""
+
+_MODELS = {"idm": car_following.IDM, "iidm": car_following.IIDM, "acc": car_following.ACC}
+_TOTALS = {
+    "entered": "vehicles, those of the start included",
+    "left": "vehicles that reached their goals",
+    "waiting": "vehicles still outside for want of room",
+    "full": "decisions at which somebody could not enter for want of a slot",
+    "collided": "vehicles that touched another, the ego included",
+    "ran_red": "vehicles that crossed a stop line on red",
+    "missed": "vehicles that took another goal for want of a gap to change lanes",
+    "gridlock": "1 if somebody stood for two minutes",
+}
+_SHARE_OF_MEMORY = 0.25
+_TEMPORARIES = 12  # a world needs so many times the memory of its arrays while it runs
+_CHUNKS = {"cpu": 64, "gpu": 2048, "tpu": 2048}  # worlds per call, if memory allows
+
+
+class Replay(NamedTuple):
+    """One world, every step of it."""
+
+    network: Network
+    lane_map: LaneMap
+    trace: Trace  # [T, ...], NumPy
+    ego: int  # slot
+    moments: list[dict[str, Any]]
+    metrics: dict[str, float]
+
+
+UNITS: dict[str, str] = (
+    NAMES
+    | {f"traffic_{name}": what for name, what in TRAFFIC_NAMES.items()}
+    | {f"traffic_{name}": what for name, what in _TOTALS.items()}
+)
+"""What every column means."""
+
+
+class Episodes:
+    """Runs an experiment, chunk by chunk.
+
+    Args:
+      experiment: what to run.
+      chunk: worlds per call; by default as many as memory allows, at most 64 on CPUs and 2048 on others.
+
+    Raises:
+      ExperimentError: the experiment does not fit its map or names what is not there; one line.
+    """
+
+    def __init__(self, experiment: Experiment, *, chunk: int | None = None) -> None:
+        self.experiment = experiment
+        self.scenario, self.policy, self.horizon = experiment.name, experiment.policy, experiment.horizon
+        self.units = UNITS
+        self._check_success()
+        self._policy = _policy(experiment)
+        self.network, self.lane_map, goals = _map(experiment)
+        self._egos = _ego(experiment, self.network, self.lane_map, goals, self._policy.free)
+        self._demand = _demand(experiment, self.network, self.lane_map, goals, self._egos)
+        room = self._demand.initial + (self._egos.count if self._egos.lane is not None else 0)
+        if room > experiment.slots:
+            self._refuse("slots", f"{experiment.slots}, but {room} vehicles are there at the start")
+        if room < 1:
+            self._refuse("traffic.density", "a random start needs at least one vehicle at the start")
+        config = Config(dt=experiment.dt, decision_every=experiment.decision_every)
+        traffic = experiment.traffic
+        behaviour = Traffic(
+            model=_MODELS[traffic.model](),
+            lane_changes=traffic.lane_changes,
+            after_collision=traffic.after_collision,
+        )
+        self._run = Rollout(config, behaviour, experiment.horizon, self._policy, measure=EvaluateEgo())
+        self.world_bytes = self._memory()
+        self.chunk = self._chunk() if chunk is None else chunk
+        self._worlds = Worlds(self._run, self.lane_map, self._sample, chunk=self.chunk)
+        self.chunk = self._worlds.chunk
+
+    def _refuse(self, field: str, message: str) -> None:
+        raise ExperimentError(f"{self.experiment.name}: {field}: {message}")
+
+    def _check_success(self) -> None:
+        unknown = [name for name in self.experiment.success if name not in self.units]
+        if unknown:
+            self._refuse(f"success.{unknown[0]}", f"no such metric; known are {', '.join(self.units)}")
+
+    def _sample(self, key: jax.Array) -> Scenario:
+        return sample_scenario(self._demand, self.lane_map, key, self.experiment.slots, self._egos)
+
+    def _memory(self) -> int:
+        """Bytes that one more world needs: its arrays at the start, and temporaries in proportion."""
+        scenario = jax.eval_shape(self._sample, jax.random.key(0))
+        return _TEMPORARIES * sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(scenario))
+
+    def _chunk(self) -> int:
+        device = jax.local_devices()[0]
+        stats = device.memory_stats() if device.platform != "cpu" else None
+        if stats and "bytes_limit" in stats:
+            memory = stats["bytes_limit"] * jax.local_device_count()
+        else:
+            memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        most = int(_SHARE_OF_MEMORY * memory / self.world_bytes)
+        wanted = _CHUNKS.get(device.platform, 64)
+        return max(1, 2 ** int(math.log2(max(1, min(most, wanted)))))
+
+    def provenance(self) -> dict[str, Any]:
+        """Where the rows come from."""
+        device = jax.local_devices()[0]
+        return {
+            "experiment": self.experiment.model_dump(mode="json", exclude={"map"}),
+            "map": {"file": os.path.basename(self.network.source), "hash": self.network.file_hash},
+            "map_file": self._map_file(),
+            "version": limsim_jax.__version__,
+            "source": _source_hash(),
+            "chunk": self.chunk,
+            "platform": device.platform,
+            "device": device.device_kind,
+            "devices": jax.local_device_count(),
+            "machine": platform.machine(),
+            "python": platform.python_version(),
+            "jax": jax.__version__,
+            "jaxlib": importlib.import_module("jaxlib").__version__,
+            "memory": {
+                "bytes_per_world": self.world_bytes,
+                "share_of_memory": _SHARE_OF_MEMORY,
+                "bytes_per_chunk": self.world_bytes * self.chunk,
+            },
+        }
+
+    def _map_file(self) -> str:
+        """Where to find the map again: a bundled one by its name."""
+        name = self.experiment.map
+        return name if name in bundled_maps() else os.path.abspath(name)
+
+    def compile(self) -> None:
+        """Compile now; else the first chunk does."""
+        self._worlds.compile()
+
+    def run(self, seeds: Sequence[int]) -> Outcome:
+        """Run at most `chunk` worlds."""
+        if len(seeds) > self.chunk:
+            raise ValueError(f"{len(seeds)} seeds at once; at most {self.chunk}")
+        (_, result), *_ = self._worlds.chunks(seeds)
+        metrics = self._columns(result)
+        return Outcome(
+            seeds=np.asarray(seeds, np.int64),
+            metrics=metrics,
+            moments=_moments(np.asarray(seeds, np.int64), metrics),
+            digest=_digest(metrics, result.state),
+        )
+
+    def _columns(self, result: Any) -> dict[str, NDArray[np.float64]]:
+        metrics: dict[str, NDArray[np.float64]] = dict(on_host(result.measures))
+        metrics |= {f"traffic_{name}": np.asarray(getattr(result.totals, name), float) for name in _TOTALS}
+        if self.experiment.success:
+            metrics["success"] = _succeeds(metrics, self.experiment.success)
+        return {name: metrics[name] for name in self.units}
+
+    def replay(self, seed: int) -> Replay:
+        """Run one world again and keep every step."""
+        ((_, result),) = self._recorded.chunks([seed])
+        metrics = self._columns(result)
+        moments = _moments(np.asarray([seed], np.int64), metrics)
+        columns = {name: column.tolist() for name, column in moments.items()}
+        rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        one = jax.tree.map(lambda x: x[0], result.trace)
+        return Replay(
+            self.network, self.lane_map, one, 0, rows, {name: float(x[0]) for name, x in metrics.items()}
+        )
+
+    @cached_property
+    def _recorded(self) -> Worlds:
+        run = replace(self._run, record=trace)
+        return Worlds(run, self.lane_map, self._sample, chunk=1, devices=jax.local_devices()[:1])
+
+
+@cache
+def _source_hash() -> str:
+    """Of all code of the package: rows of other code are other rows."""
+    package = Path(limsim_jax.__file__).parent
+    hashed = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        hashed.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
+    return hashed.hexdigest()[:16]
+
+
+# --- from the words of the file to arrays ------------------------------------------------------------
+
+
+def _policy(experiment: Experiment) -> Policy:
+    name, options = experiment.ego.policy, experiment.ego.options
+    where = f"{experiment.name}: ego.policy"
+    if ":" in name:
+        module, _, attribute = name.partition(":")
+        try:
+            factory: Callable[..., Policy] = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise ExperimentError(f"{where}: '{name}' cannot be loaded: {error}") from None
+    elif name in POLICIES:
+        factory = POLICIES[name]
+    else:
+        raise ExperimentError(
+            f"{where}: unknown policy '{name}'; known are {', '.join(POLICIES)}, or module:factory"
+        )
+    try:
+        policy = factory(**options)
+    except (TypeError, ValueError) as error:
+        raise ExperimentError(f"{experiment.name}: ego.options: {error}") from None
+    if not isinstance(getattr(policy, "free", None), bool):
+        raise ExperimentError(f"{where}: '{name}' is no policy; see limsim_jax.policies.base.Policy")
+    return policy
+
+
+def _map(experiment: Experiment) -> tuple[Network, LaneMap, dict[str, tuple[str, ...]]]:
+    path = bundled_maps().get(experiment.map, experiment.map)
+    try:
+        network = load_map(path)
+    except MapError as error:
+        known = ", ".join(bundled_maps())
+        hint = "" if os.path.exists(path) else f"; bundled maps are {known}"
+        raise ExperimentError(f"{experiment.name}: map: {error}{hint}") from None
+    goals = dict(default_goals(network))
+    wanted = [experiment.ego.goal] if experiment.ego.goal else []
+    for flow in experiment.traffic.flow:
+        wanted += [flow.goal] if isinstance(flow.goal, str) else list(flow.goal or ())
+    added = False
+    for goal in wanted:
+        if goal not in goals and goal in network.lanes:
+            goals[goal] = (goal,)
+            added = True
+    return network, build_lane_map(network, goals if added else None), goals
+
+
+def _ego(
+    experiment: Experiment,
+    network: Network,
+    lane_map: LaneMap,
+    goals: Mapping[str, tuple[str, ...]],
+    free: bool,
+) -> EgoStart:
+    ego, name = experiment.ego, experiment.name
+    try:
+        population = uniform_population(ego.vehicle, **ego.driver)
+    except ValueError as error:
+        raise ExperimentError(f"{name}: ego: {error}") from None
+    vehicle = jnp.argmax(population.share)[None].astype(jnp.int32)
+    driver, shape = sample_vehicles(population, jax.random.key(0), jnp.zeros(1, jnp.int32), vehicle)
+    common = {"driver": driver, "shape": shape, "free": jnp.asarray([free])}
+    common["v"] = None if ego.v is None else jnp.asarray([ego.v], jnp.float32)
+    if ego.start == "random":
+        return EgoStart(**common)
+    lane = _start_lane(name, ego, network)
+    length = network.lanes[lane].length
+    if not ego.s < length:
+        raise ExperimentError(f"{name}: ego.s: {ego.s:g} m, but lane '{lane}' is only {length:.1f} m long")
+    if ego.goal is None or ego.goal not in goals:
+        raise ExperimentError(f"{name}: ego.goal: no goal or lane '{ego.goal}'; goals are {', '.join(goals)}")
+    row, column = lane_rows(network)[lane], list(goals).index(ego.goal)
+    if not bool(lane_map.routes.reachable[row, column]):
+        can = [goal for k, goal in enumerate(goals) if bool(lane_map.routes.reachable[row, k])]
+        raise ExperimentError(
+            f"{name}: ego.goal: '{ego.goal}' cannot be reached from lane '{lane}'; "
+            f"from there it goes to {', '.join(can) or 'nowhere'}"
+        )
+    return EgoStart(
+        lane=jnp.asarray([row], jnp.int32),
+        s=jnp.asarray([max(ego.s, float(shape.length[0]))], jnp.float32),
+        goal=jnp.asarray([column], jnp.int32),
+        **common,
+    )
+
+
+def _start_lane(name: str, ego: EgoTable, network: Network) -> str:
+    """The lane that the ego starts on."""
+    known = entries(network)
+    if ego.start in network.lanes:
+        lanes = [ego.start]
+    elif ego.start in known:
+        lanes = list(known[ego.start])
+    else:
+        road = [lane for lane in network.drivable_lanes() if lane.road == ego.start and lane.junction is None]
+        first = [lane for lane in road if lane.section == min(x.section for x in road)]
+        if len({lane.number < 0 for lane in first}) > 1:
+            raise ExperimentError(
+                f"{name}: ego.start: road '{ego.start}' has traffic both ways; name one of its lanes, as "
+                f"'{first[0].id}'"
+            )
+        lanes = [lane.id for lane in first]
+    if not lanes:
+        raise ExperimentError(
+            f"{name}: ego.start: no entry, road or lane '{ego.start}'; entries are {', '.join(known)}"
+        )
+    rightmost = [lane for lane in lanes if network.lanes[lane].right not in lanes]
+    ordered = rightmost[:1]
+    while ordered and network.lanes[ordered[-1]].left in lanes:
+        ordered.append(str(network.lanes[ordered[-1]].left))
+    if ego.lane >= len(ordered):
+        raise ExperimentError(
+            f"{name}: ego.lane: {ego.lane}, but '{ego.start}' has lanes 0 to {len(ordered) - 1}"
+        )
+    chosen = network.lanes[ordered[ego.lane]]
+    if not chosen.drivable or chosen.junction is not None:
+        raise ExperimentError(f"{name}: ego.start: lane '{chosen.id}' is no lane to start on")
+    return chosen.id
+
+
+def _demand(
+    experiment: Experiment,
+    network: Network,
+    lane_map: LaneMap,
+    goals: Mapping[str, tuple[str, ...]],
+    egos: EgoStart,
+) -> Demand:
+    traffic, origins = experiment.traffic, list(entries(network))
+    flows = []
+    for flow in traffic.flow:
+        for origin in origins if flow.origin == "*" else [flow.origin]:
+            fields: dict[str, Any] = flow.model_dump() | {"origin": origin}
+            flows.append(Flow(**fields))
+    try:
+        population = default_population(traffic.mix) if traffic.mix is not None else default_population()
+        population = fitting(population, lane_map)
+
+        def build(density: float) -> Demand:
+            return build_demand(
+                network, lane_map, goals, flows, population, horizon=experiment.horizon, density=density,
+                egos=egos,
+            )  # fmt: skip
+
+        if traffic.vehicles is None:
+            return build(traffic.density)
+        km = sum(lane.length for lane in network.drivable_lanes() if lane.junction is None) / 1000
+        demand = build(traffic.vehicles / max(km, 1e-3))
+        if demand.initial not in (0, traffic.vehicles):  # lanes that are closed to all have no places
+            demand = build(traffic.vehicles / max(km, 1e-3) * traffic.vehicles / demand.initial)
+        return demand
+    except ValueError as error:
+        raise ExperimentError(f"{experiment.name}: traffic: {error}") from None
+
+
+# --- from arrays to rows -----------------------------------------------------------------------------
+
+
+def _succeeds(
+    metrics: Mapping[str, NDArray[np.float64]], criteria: Mapping[str, bool | float | Bounds]
+) -> NDArray[np.float64]:
+    """1 where all criteria are met; what could not be measured meets none."""
+    good = np.ones(len(next(iter(metrics.values()))), bool)
+    for name, wanted in criteria.items():
+        value = metrics[name]
+        if isinstance(wanted, Bounds):
+            least, most = wanted.min, wanted.max
+            good &= value >= (-np.inf if least is None else least)
+            good &= value <= (np.inf if most is None else most)
+        else:
+            good &= value == float(wanted)
+    return good.astype(float)
+
+
+def _moments(seeds: NDArray[np.int64], metrics: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[Any]]:
+    """When things went wrong or nearly did, the worst of each world first."""
+    m = metrics
+    nobody = np.full(len(seeds), np.nan)
+    found = {
+        "contact": (m["contact_time"], m["contact_delta_v"], m["contact_other"], m["contact_time"] >= 0),
+        "off_road": (m["off_road_time"], m["off_road"], nobody, m["off_road_time"] >= 0),
+        "red_light": (m["red_light_time"], m["red_lights"], nobody, m["red_light_time"] >= 0),
+        "near_miss": (m["min_ttc_time"], m["min_ttc"], nobody, m["min_ttc"] < NEAR_MISS[0]),
+        "hard_brake": (m["max_drac_time"], m["max_drac"], nobody, m["max_drac"] > HARD),
+        "unsafe": (m["rss_first_time"], nobody, nobody, m["rss_first_time"] >= 0),
+    }
+    rows = []
+    for i, seed in enumerate(seeds.tolist()):
+        rank = 0
+        for kind in MOMENTS:
+            time, value, other, there = (column[i] for column in found[kind])
+            lead_up = kind in ("near_miss", "hard_brake") and abs(time - m["contact_time"][i]) < LEAD_UP
+            if there and not lead_up:
+                rank += 1
+                who = m["contact_responsibility"][i] if kind == "contact" else np.nan
+                known = not np.isnan(who) and who != Responsibility.NONE
+                responsible = Responsibility(int(who)).name.lower() if known else None
+                rows.append((seed, rank, kind, time, other, value, responsible))
+    columns = list(zip(*rows, strict=True)) or [[]] * 7
+    return {
+        "seed": np.asarray(columns[0], np.int64),
+        "rank": np.asarray(columns[1], np.int32),
+        "kind": np.asarray(columns[2], object),
+        "time": np.asarray(columns[3], np.float64),
+        "other": np.asarray(columns[4], np.float64),
+        "value": np.asarray(columns[5], np.float64),
+        "responsible": np.asarray(columns[6], object),
+    }
+
+
+def _digest(metrics: Mapping[str, NDArray[np.float64]], state: Any) -> NDArray[np.uint64]:
+    """A hash of every world's row and final state."""
+    leaves = [np.asarray(x) for x in jax.tree.leaves(state)]
+    columns = np.stack([metrics[name] for name in metrics], -1)
+    digests = []
+    for i in range(len(columns)):
+        hashed = hashlib.blake2b(columns[i].tobytes(), digest_size=8)
+        for leaf in leaves:
+            hashed.update(leaf[i].tobytes())
+        digests.append(int.from_bytes(hashed.digest(), "little"))
+    return np.asarray(digests, np.uint64)

@@ -1,0 +1,242 @@
+"""Experiment files: which traffic, which ego, which policy, for how long.
+
+A TOML file describes one `Experiment`, or names others: `experiments = ["highway.toml", "ramp.toml"]`.
+Whatever is wrong is one line that names the file and the field.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from limsim_jax.traffic.collision import AfterCollision
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=60)]
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+class ExperimentError(ValueError):
+    """An experiment cannot be run as it stands; one line that names file and field."""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class Flow(_Table):
+    """Vehicles that come in: see `traffic.demand.Flow`."""
+
+    origin: str | list[str] = "*"
+    """Names as `limsim_jax.entries` has them, road or lane ids; "*": every entry of the map."""
+    rate: NotNegative
+    """Vehicles per hour, of each origin."""
+    goal: str | dict[str, float] | None = None
+    pattern: Literal["poisson", "uniform", "platoon"] = "poisson"
+    begin: NotNegative = 0.0
+    """s"""
+    end: Positive | None = None
+    """s"""
+    speed: NotNegative | None = None
+    """m/s"""
+    classes: dict[str, float] | None = None
+    platoon: Annotated[int, Field(ge=1)] = 5
+    headway: Positive = 2.0
+    """s"""
+
+
+class TrafficTable(_Table):
+    """Everybody but the ego."""
+
+    vehicles: Annotated[int, Field(ge=0)] | None = None
+    """On the road at the start, the ego not counted unless its start is random."""
+    density: NotNegative = 0.0
+    """Instead of that, vehicles per km of lane at the start."""
+    flow: list[Flow] = Field(default_factory=list)
+    mix: dict[str, NotNegative] | None = None
+    """Shares of vehicle classes."""
+    model: Literal["idm", "iidm", "acc"] = "acc"
+    lane_changes: bool = True
+    after_collision: AfterCollision = "stop"
+
+    @model_validator(mode="after")
+    def _one_number(self) -> TrafficTable:
+        if self.vehicles is not None and self.density:
+            raise ValueError("vehicles or density, not both")
+        return self
+
+
+class EgoTable(_Table):
+    """The vehicle under test."""
+
+    start: str = "random"
+    """An entry of the map, a road or lane id; "random": the place and goal of some vehicle at the start."""
+    lane: Annotated[int, Field(ge=0)] = 0
+    """Which of the lanes there, from the right."""
+    s: NotNegative = 10.0
+    """m along the lane, front bumper."""
+    v: NotNegative | None = None
+    """m/s; absent: as fast as road and leader allow."""
+    goal: str | None = None
+    """Where it goes: a way out of the map or a lane id. Not with a random start."""
+    policy: str = "like_traffic"
+    """One of `limsim_jax.policies`, or "package.module:factory" of your own."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Arguments of the policy."""
+    vehicle: str = "car"
+    driver: dict[str, float] = Field(default_factory=dict)
+    """Fields of `types.Driver` that differ from those of a typical driver."""
+
+    @model_validator(mode="after")
+    def _goal_belongs_to_start(self) -> EgoTable:
+        if (self.start == "random") != (self.goal is None):
+            raise ValueError(
+                "a goal is missing"
+                if self.goal is None
+                else "an ego with a random start has no goal of its own"
+            )
+        return self
+
+
+class Bounds(_Table):
+    """What a metric must keep to."""
+
+    min: float | None = None
+    max: float | None = None
+
+
+class Experiment(_Table):
+    """One experiment. `Field`s have the units that their descriptions say."""
+
+    name: Name
+    map: str
+    """Name of a bundled map, or a file, seen from the experiment file."""
+    horizon: Positive
+    """s"""
+    description: str = ""
+    dt: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+    """s, physics step."""
+    decision_every: Annotated[int, Field(ge=1)] = 5
+    """Physics steps per decision."""
+    slots: Annotated[int, Field(ge=1, le=4096)] = 64
+    """Vehicles that can be on the road at once."""
+    traffic: TrafficTable = TrafficTable()
+    ego: EgoTable = EgoTable()
+    success: dict[str, bool | int | float | Bounds] = Field(default_factory=dict)
+    """What counts as success: metrics with the value or the bounds they must keep; absent: to arrive
+    without a contact and without leaving the road."""
+
+    @property
+    def policy(self) -> str:
+        """Name of the policy, fit for a folder."""
+        return self.ego.policy.rpartition(":")[2]
+
+
+def bundled_experiments() -> dict[str, Path]:
+    """The experiments that come with the package: name to path."""
+    installed, checkout = _PACKAGE / "_bundled", _PACKAGE.parent / "experiments"
+    folder = installed if installed.is_dir() else checkout
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def read_experiments(
+    path: str | Path, *, map_file: str | None = None, policy: str | None = None
+) -> list[Experiment]:
+    """Read an experiment file, or the name of a bundled one.
+
+    Args:
+      path: of the file.
+      map_file: another map than that of the file.
+      policy: another policy than that of the file.
+
+    Raises:
+      ExperimentError: with the file and the field.
+    """
+    path = Path(path)
+    if not path.exists() and path.name == str(path):
+        known = bundled_experiments()
+        if path.stem not in known:
+            raise ExperimentError(
+                f"{path}: no such file, and no bundled experiment either; bundled are {', '.join(known)}"
+            )
+        path = known[path.stem]
+    try:
+        found = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ExperimentError(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ExperimentError(f"{path}: not a text file in UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ExperimentError(f"{path}: not valid TOML: {error}") from None
+    if "experiments" in found:
+        others = found["experiments"]
+        if set(found) - {"experiments", "description"}:
+            extra = ", ".join(sorted(set(found) - {"experiments", "description"}))
+            raise ExperimentError(
+                f"{path}: next to 'experiments' there can be a description only, not {extra}"
+            )
+        if not isinstance(others, list) or not others or not all(isinstance(x, str) for x in others):
+            raise ExperimentError(f'{path}: experiments: a list of file names, as ["highway.toml"]')
+        nested = [read_experiments(path.parent / other, map_file=map_file, policy=policy) for other in others]
+        experiments = [experiment for some in nested for experiment in some]
+        names = [experiment.name for experiment in experiments]
+        for name in names:
+            if names.count(name) > 1:
+                raise ExperimentError(f"{path}: two experiments are named '{name}'")
+        return experiments
+    return [_experiment(found, path, map_file, policy)]
+
+
+def _experiment(found: Mapping[str, Any], path: Path, map_file: str | None, policy: str | None) -> Experiment:
+    found = {"name": path.stem, **found}
+    if map_file is not None:
+        found["map"] = map_file
+    elif isinstance(found.get("map"), str) and (path.parent / found["map"]).exists():
+        found["map"] = str(path.parent / found["map"])
+    if policy is not None:
+        ego: dict[str, Any] = dict(found.get("ego", {}))
+        ego.pop("options", None)
+        found["ego"] = ego | {"policy": policy}
+    try:
+        return Experiment.model_validate(found)
+    except ValidationError as error:
+        raise ExperimentError(f"{path}: {_first(error)}") from None
+
+
+def _first(error: ValidationError) -> str:
+    """The first thing that is wrong, in the file's words."""
+    errors = error.errors()
+    first = errors[0]
+    where = ".".join(str(part) for part in first["loc"] if not _is_branch(part))
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        message = "no such field"
+        known = _fields_at(first["loc"][:-1])
+        if known:
+            message += f"; known are {', '.join(known)}"
+    elif first["type"] != "missing" and first["type"] != "value_error":
+        message += f", not {first['input']!r}"
+    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    return f"{where}: {message}{more}" if where else f"{message}{more}"
+
+
+def _is_branch(part: Any) -> bool:
+    """Names that pydantic gives to the members of a union."""
+    return isinstance(part, str) and ("[" in part or part in ("str", "float", "int", "bool", "Bounds"))
+
+
+def _fields_at(where: tuple[Any, ...]) -> list[str]:
+    tables: dict[tuple[str, ...], type[BaseModel]] = {
+        (): Experiment,
+        ("ego",): EgoTable,
+        ("traffic",): TrafficTable,
+        ("traffic", "flow"): Flow,
+    }
+    table = tables.get(tuple(part for part in where if isinstance(part, str)))
+    return list(table.model_fields) if table else []

@@ -1,0 +1,189 @@
+"""From the engine to the metrics: what an episode is said to be, against loops over its trace."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from limsim_jax.maps.lane_map import NO_LANE
+from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.metrics.safety import encounter, overlaps
+from limsim_jax.sweep.episode import Episodes, _moments, _succeeds
+from limsim_jax.sweep.experiment import Bounds, Experiment
+
+SEEDS = (0, 3, 5)
+SLOTS = 32
+
+
+def experiment(policy: str, **more) -> Experiment:
+    """A short crossing with lights; blind egos do hit others here."""
+    told = {
+        "name": "crossing", "map": "intersection", "horizon": 20.0, "slots": SLOTS,
+        "ego": {"start": "6-", "s": 60.0, "goal": "2", "policy": policy},
+        "traffic": {"vehicles": 20, "flow": [{"rate": 350}]},
+    }  # fmt: skip
+    return Experiment.model_validate(told | more)
+
+
+@functools.cache
+def episodes(policy: str) -> Episodes:
+    return Episodes(experiment(policy), chunk=4)
+
+
+@functools.cache
+def replayed(policy: str, seed: int):
+    return episodes(policy).replay(seed)
+
+
+def cases():
+    return [(policy, seed) for policy in ("like_traffic", "constant_speed") for seed in SEEDS]
+
+
+@pytest.mark.parametrize("policy, seed", cases())
+def test_the_ego_as_its_trace_has_it(policy, seed):
+    _, lane_map, trace, ego, _, metrics = replayed(policy, seed)
+    on = trace.active[:, ego]
+    v, lane, s = trace.v[on, ego], trace.lane[on, ego], trace.s[on, ego]
+    assert metrics["duration"] == pytest.approx(trace.time[on][-1], abs=0.11)
+    assert metrics["distance"] == pytest.approx(v.sum() * 0.1, rel=0.01)
+    assert metrics["mean_speed"] == pytest.approx(metrics["distance"] / metrics["duration"], rel=1e-4)
+    limit = np.asarray(lane_map.speed_limit)[lane]
+    assert metrics["max_overspeed"] == pytest.approx(np.maximum(v - limit, 0).max(), abs=1e-4)
+    assert metrics["speeding"] == pytest.approx((v > limit + 0.01).mean(), abs=0.005)
+    goal = episodes(policy)._egos.goal[0]
+    to_go = np.asarray(lane_map.routes.distance)[lane, goal] - s
+    reached = to_go < 1e8
+    start = np.asarray(lane_map.routes.distance)[episodes(policy)._egos.lane[0], goal] - 60.0
+    share = 1 - to_go[reached][-1] / start
+    expected = 1.0 if metrics["arrived"] else share
+    assert metrics["completion"] == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize("policy, seed", cases())
+def test_contacts_are_where_bodies_overlap(policy, seed):
+    _, _, trace, ego, _, metrics = replayed(policy, seed)
+    still = np.zeros(2, np.float32)
+    first, who = None, None
+    for t in range(len(trace.time)):
+        others = [j for j in range(SLOTS) if j != ego and trace.active[t, j] and trace.active[t, ego]]
+        hit = [j for j in others if overlaps(encounter(trace.box[t, ego], still, trace.box[t, j], still))]
+        if hit:
+            first, who = float(trace.time[t]), hit[0]
+            break
+    if first is None:
+        assert metrics["contacts"] == 0 and np.isnan(metrics["contact_time"])
+    else:
+        assert metrics["contact_time"] == pytest.approx(first, abs=1e-4)
+        assert metrics["contact_other"] == who and metrics["contacts"] >= 1 and metrics["success"] == 0
+
+
+def test_both_kinds_of_end_occur():
+    contacts = [replayed("constant_speed", seed).metrics["contacts"] for seed in SEEDS]
+    assert max(contacts) > 0, "else the test above tells little"
+    assert all(replayed("like_traffic", seed).metrics["contacts"] == 0 for seed in SEEDS)
+
+
+@pytest.mark.parametrize("policy, seed", cases())
+def test_lights_crossed_on_red(policy, seed):
+    _, lane_map, trace, ego, _, metrics = replayed(policy, seed)
+    crossed = 0
+    for t in range(1, len(trace.time)):
+        if not trace.active[t, ego] or trace.lane[t, ego] == trace.lane[t - 1, ego]:
+            continue
+        shows = np.asarray(lane_states(lane_map.signals, trace.phase[t]))
+        before = trace.lane[t - 1, ego]
+        handed_over = trace.s[t, ego] < 5  # not a lane change
+        near = trace.s[t - 1, ego] <= float(lane_map.stop_s[before]) + 0.5
+        crossed += bool(shows[trace.lane[t, ego]] == SignalState.RED and handed_over and near)
+    assert metrics["red_lights"] == crossed
+    if policy == "like_traffic":
+        assert crossed == 0
+
+
+@pytest.mark.parametrize("policy, seed", cases())
+def test_headway_to_the_leader_on_the_lane(policy, seed):
+    """At least as short as to the nearest on the same lane, found by a loop."""
+    _, _, trace, ego, _, metrics = replayed(policy, seed)
+    least = np.inf
+    until = metrics["contact_time"] - 0.5 if metrics["contacts"] else np.inf
+    for t in range(5, len(trace.time)):
+        lane = trace.lane[t, ego]
+        if not trace.active[t, ego] or lane == NO_LANE or trace.time[t] > until or trace.d[t, ego] != 0:
+            continue
+        ahead = trace.active[t] & (trace.lane[t] == lane) & (trace.s[t] > trace.s[t, ego])
+        ahead &= trace.lane[t] == trace.lane[t - 5]  # since the last decision at least
+        if ahead.any() and trace.v[t, ego] > 0.5:
+            gap = (trace.s[t] - trace.box[t, :, 3])[ahead].min() - trace.s[t, ego]
+            least = min(least, gap / trace.v[t, ego])
+    if np.isfinite(least):
+        assert metrics["min_thw"] <= least * 1.02 + 0.02
+
+
+@pytest.mark.parametrize("policy, seed", cases())
+def test_traffic_as_the_trace_has_it(policy, seed):
+    _, _, trace, _, _, metrics = replayed(policy, seed)
+    time = trace.active.sum() * 0.1
+    distance = (trace.v * trace.active).sum() * 0.1
+    assert metrics["traffic_mean_speed"] == pytest.approx(distance / time, rel=0.01)
+    assert metrics["traffic_vehicle_km"] == pytest.approx(distance / 1000, rel=0.01)
+    assert metrics["traffic_trips"] == metrics["traffic_left"]
+    queue = [(trace.active[t] & (trace.v[t] < 5 / 3.6)).sum() for t in range(len(trace.time))]
+    assert metrics["traffic_max_queue"] == max(queue)
+    assert metrics["traffic_mean_queue"] == pytest.approx(np.mean(queue), abs=0.05)
+
+
+def test_a_batch_says_the_same_as_worlds_alone():
+    outcome = episodes("constant_speed").run([5, 0, 3])
+    for i, seed in enumerate((5, 0, 3)):
+        alone = replayed("constant_speed", seed).metrics
+        for name, value in alone.items():
+            # jerk is a difference of small numbers: programs that keep the trace may round otherwise
+            np.testing.assert_allclose(outcome.metrics[name][i], value, rtol=2e-3, atol=1e-3, err_msg=name)
+    again = episodes("constant_speed").run([3])
+    assert again.digest[0] == outcome.digest[2] != outcome.digest[1]
+    assert outcome.seeds.tolist() == [5, 0, 3]
+    with pytest.raises(ValueError, match="5 seeds at once; at most 4"):
+        episodes("constant_speed").run(range(5))
+
+
+# --- from numbers to rows ----------------------------------------------------------------------------
+
+
+def rows(**columns):
+    """Two worlds in which nothing is measured but what is told."""
+    names = (
+        "contact_time contact_delta_v contact_other contact_responsibility off_road_time off_road "
+        "red_light_time red_lights min_ttc_time min_ttc max_drac_time max_drac rss_first_time"
+    ).split()
+    nothing = {name: np.array([np.nan, np.nan]) for name in names}
+    return nothing | {name: np.array(values, float) for name, values in columns.items()}
+
+
+def test_key_moments_are_ranked():
+    nan = np.nan
+    found = _moments(
+        np.array([7, 9]),
+        rows(
+            contact_time=[nan, 12.0], contact_delta_v=[nan, 6.5], contact_other=[nan, 4],
+            contact_responsibility=[nan, 1], min_ttc_time=[3.0, 11.9], min_ttc=[1.2, 0.0],
+            max_drac_time=[5.0, 4.0], max_drac=[3.3, 4.4], rss_first_time=[2.0, nan],
+            off_road_time=[nan, 13.0], off_road=[0, 0.1],
+        ),
+    )  # fmt: skip
+    table = list(zip(*(found[name].tolist() for name in ("seed", "rank", "kind", "time")), strict=True))
+    assert table == [
+        (7, 1, "near_miss", 3.0),  # 3.3 m/s^2 is not hard
+        (7, 2, "unsafe", 2.0),
+        (9, 1, "contact", 12.0),
+        (9, 2, "off_road", 13.0),
+        (9, 3, "hard_brake", 4.0),  # the near miss is that contact
+    ]
+    assert found["responsible"].tolist() == [None, None, "ego", None, None]
+    assert found["other"].tolist()[2] == 4 and found["value"].tolist()[2] == 6.5
+
+
+def test_success_is_what_the_file_says():
+    metrics = {"arrived": np.array([1.0, 1, 0, 1]), "completion_time": np.array([20.0, 31, np.nan, 30])}
+    good = _succeeds(metrics, {"arrived": True, "completion_time": Bounds(max=30)})
+    assert good.tolist() == [1, 0, 0, 1]
+    assert _succeeds(metrics, {"completion_time": Bounds(min=21)}).tolist() == [0, 1, 0, 1]
