@@ -10,7 +10,7 @@ import pytest
 from traffic_worlds import bundled
 
 from limsim_jax.maps.routing import default_goals
-from limsim_jax.rollout import Rollout, Worlds, begin, fork, load, save, trace, world_key
+from limsim_jax.rollout import Rollout, Worlds, fork, load, save, trace, world_key
 from limsim_jax.traffic.demand import Flow, build_demand, entries, sample_scenario
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.vehicles import default_population, fitting

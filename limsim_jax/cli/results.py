@@ -218,7 +218,9 @@ def replay(
     for row in moments:
         value = "" if math.isnan(row["value"]) else f", {row['value']:.2f}"
         who = f", responsible: {row['responsible']}" if row["responsible"] else ""
-        print(f"{row['time']:6.1f} s  {row['kind']}{value}{who}")
+        able = [name for name in ("ego", "other") if row.get(f"avoidable_by_{name}")]
+        saved = f", had braked in time, would have avoided it: {' or '.join(able)}" if able else ""
+        print(f"{row['time']:6.1f} s  {row['kind']}{value}{who}{saved}")
     stored = _stored(opened, group, seed)
     if stored is not None and (differs := [x for x in metrics if not _alike(metrics[x], stored[x])]):
         print(f"note: not the episode that is stored: {', '.join(differs[:3])} differ; 'verify' may tell why")

@@ -373,7 +373,8 @@ def _worst(
                     f"replay {number} of {len(shown)}: {row['scenario']}, {row['policy']}, seed {row['seed']}"
                 )
             try:
-                views, replays[_key(row)] = _replayed(row, names, path, replayer)
+                views, replays[_key(row)], found = _replayed(row, names, path, replayer)
+                row = {**row, **found}
             except ValueError as error:  # one episode that cannot be shown is no reason to lose the page
                 views = f'<div class="none">No picture: {escape(str(error))}</div>'
         cards.append(_card(row, views, replays.get(_key(row)), names))
@@ -388,8 +389,11 @@ def _worst(
     )
 
 
-def _replayed(row: Mapping[str, Any], names: _Names, path: Path, replayer: Replayer) -> tuple[str, str]:
-    """Pictures of an episode's key moment, and the relative address of its replay, which is written."""
+def _replayed(
+    row: Mapping[str, Any], names: _Names, path: Path, replayer: Replayer
+) -> tuple[str, str, dict[str, Any]]:
+    """Pictures of an episode's key moment, the relative address of its replay, which is written, and who
+    could have avoided it."""
     from limsim_jax.report.viewer import write_viewer
 
     network, lane_map, trace, ego, moments, *_ = replayer(row["scenario"], row["policy"], row["seed"])
@@ -404,7 +408,9 @@ def _replayed(row: Mapping[str, Any], names: _Names, path: Path, replayer: Repla
         f'{base64.b64encode(png).decode()}"><figcaption>{caption}</figcaption></figure>'
         for caption, png in views
     )
-    return f'<div class="views">{figures}</div>', f"replays/{quote(name)}"
+    worst = next((m for m in moments if m["kind"] == row["kind"]), {})
+    found = {key: worst[key] for key in ("avoidable_by_ego", "avoidable_by_other") if key in worst}
+    return f'<div class="views">{figures}</div>', f"replays/{quote(name)}", found
 
 
 def _file_name(name: str) -> str:

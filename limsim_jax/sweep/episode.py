@@ -27,21 +27,33 @@ from limsim_jax.metrics.blame import Responsibility
 from limsim_jax.metrics.episode import NAMES
 from limsim_jax.metrics.observer import EvaluateEgo
 from limsim_jax.metrics.reductions import on_host
-from limsim_jax.metrics.safety import NEAR_MISS
+from limsim_jax.metrics.safety import NEAR_MISS, Rss
 from limsim_jax.metrics.traffic import NAMES as TRAFFIC_NAMES
 from limsim_jax.policies import POLICIES
 from limsim_jax.policies.base import Policy
-from limsim_jax.rollout import Rollout, Trace, Worlds, trace
+from limsim_jax.rollout import (
+    Result,
+    Rollout,
+    Totals,
+    Trace,
+    Worlds,
+    enable_compilation_cache,
+    trace,
+    world_key,
+)
 from limsim_jax.sweep.experiment import Bounds, EgoTable, Experiment, ExperimentError
 from limsim_jax.sweep.store import Outcome
 from limsim_jax.traffic import car_following
 from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand, entries, sample_scenario
-from limsim_jax.traffic.engine import Traffic
+from limsim_jax.traffic.engine import Command, Traffic
 from limsim_jax.traffic.vehicles import default_population, fitting, sample_vehicles, uniform_population
-from limsim_jax.types import Config, Scenario
+from limsim_jax.types import Config, Scenario, State
 
 HARD = 3.4
 """m/s^2 of braking asked for by the leader (DRAC) from which it is a key moment."""
+
+UNSAFE = 4.0
+"""s before a contact at which somebody may have begun to brake, at most."""
 
 LEAD_UP = 1.0
 """s around a contact within which near misses and hard braking belong to it."""
@@ -187,7 +199,7 @@ class Episodes:
         if len(seeds) > self.chunk:
             raise ValueError(f"{len(seeds)} seeds at once; at most {self.chunk}")
         (_, result), *_ = self._worlds.chunks(seeds)
-        metrics = self._columns(result)
+        metrics = self._columns(result.measures, result.totals)
         return Outcome(
             seeds=np.asarray(seeds, np.int64),
             metrics=metrics,
@@ -195,37 +207,78 @@ class Episodes:
             digest=_digest(metrics, result.state),
         )
 
-    def _columns(self, result: Any) -> dict[str, NDArray[np.float64]]:
-        metrics: dict[str, NDArray[np.float64]] = dict(on_host(result.measures))
-        metrics |= {f"traffic_{name}": np.asarray(getattr(result.totals, name), float) for name in _TOTALS}
+    def _columns(self, measures: Any, totals: Totals) -> dict[str, NDArray[np.float64]]:
+        metrics: dict[str, NDArray[np.float64]] = dict(on_host(measures))
+        metrics |= {f"traffic_{name}": np.asarray(getattr(totals, name), float) for name in _TOTALS}
         if self.experiment.success:
             metrics["success"] = _succeeds(metrics, self.experiment.success)
         return {name: metrics[name] for name in self.units}
 
     def replay(self, seed: int) -> Replay:
-        """Run one world again and keep every step."""
-        ((_, result),) = self._recorded.chunks([seed])
-        metrics = self._columns(result)
+        """Run one world again and keep every step.
+
+        After a contact the world is run twice more, in which the ego, or the other vehicle, brakes as hard as
+        it can from the response time of RSS after the first unsafe moment on (at most `UNSAFE` s before the
+        contact): who could have avoided it?
+        """
+        result = self._again(seed)
+        metrics = self._columns(result.measures, result.totals)
         moments = _moments(np.asarray([seed], np.int64), metrics)
         columns = {name: column.tolist() for name, column in moments.items()}
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-        one = jax.tree.map(lambda x: x[0], result.trace)
-        return Replay(
-            self.network, self.lane_map, one, 0, rows, {name: float(x[0]) for name, x in metrics.items()}
-        )
+        found = {name: float(x[0]) for name, x in metrics.items()}
+        if rows and rows[0]["kind"] == "contact":
+            contact, unsafe = found["contact_time"], found["rss_first_time"]
+            start = max(contact - UNSAFE, 0.0 if np.isnan(unsafe) else min(unsafe, contact))
+            for who, slot in (("ego", 0), ("other", int(found["contact_other"]))):
+                changed = self._again(seed, slot, start + Rss().response)
+                measures = on_host(changed.measures)
+                same = measures["contact_other"][0] == found["contact_other"]
+                later = measures["contact_time"][0] > contact + UNSAFE
+                rows[0][f"avoidable_by_{who}"] = bool(measures["contacts"][0] == 0 or not same or later)
+        return Replay(self.network, self.lane_map, result.trace, 0, rows, found)
+
+    def _again(self, seed: int, slot: int = -1, at: float = np.inf) -> Result:
+        """One world, every step; the vehicle in `slot` brakes from `at` s on."""
+        result = jax.device_get(self._one(self.lane_map, np.int32(seed), np.int32(slot), np.float32(at)))
+        single = jax.tree.map(lambda x: x[None], (result.measures, result.totals))
+        return result._replace(measures=single[0], totals=single[1])
 
     @cached_property
-    def _recorded(self) -> Worlds:
-        run = replace(self._run, record=trace)
-        return Worlds(run, self.lane_map, self._sample, chunk=1, devices=jax.local_devices()[:1])
+    def _one(self) -> Callable[..., Result]:
+        def one(lane_map: LaneMap, seed: jax.Array, slot: jax.Array, at: jax.Array) -> Result:
+            run = replace(self._run, record=trace, policy=_Braking(self._policy, slot, at))
+            scenario_key, policy_key = jax.random.split(world_key(seed))  # as `Worlds` does
+            return run(lane_map, self._sample(scenario_key), policy_key)
+
+        enable_compilation_cache()
+        return jax.jit(one)
+
+
+class _Braking:
+    """A policy, and a vehicle that brakes from some moment on."""
+
+    def __init__(self, policy: Policy, slot: jax.Array, at: jax.Array) -> None:
+        self.free = policy.free
+        self.init = policy.init
+        self.policy, self.slot, self.at = policy, slot, at
+
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
+    ) -> tuple[Command, Any]:
+        command, memory = self.policy(config, lane_map, state, memory, key)
+        brakes = (jnp.arange(state.lane.shape[0]) == self.slot) & (config.time(state.step) >= self.at)
+        return replace(command, brake=brakes), memory
 
 
 @cache
 def _source_hash() -> str:
-    """Of all code of the package: rows of other code are other rows."""
+    """Of all code that makes rows: rows of other code are other rows."""
     package = Path(limsim_jax.__file__).parent
     hashed = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
+        if path.relative_to(package).parts[0] in ("bench.py", "cli", "report"):
+            continue
         hashed.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
     return hashed.hexdigest()[:16]
 

@@ -22,6 +22,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -41,6 +42,9 @@ from limsim_jax.sweep.store import (
 
 LOOKS_FROM = 128
 """Worlds, rounded up to whole chunks, before the first look at an interval."""
+
+COMPILERS = 2
+"""Scenarios that compile at the same time."""
 
 LEVEL = 0.95
 """Probability that no look at an interval misses."""
@@ -157,11 +161,21 @@ def sweep(
     entries = [_entry(one) for one in episodes]
     register(out, entries)
     damaged: list[str] = []
-    parts: list[Part] = []
+    jobs: list[tuple[Episodes, Shards, list[int], set[int], _Teller]] = []
     for one, entry in zip(episodes, entries, strict=True):
         mine = _of_shard(seeds, one.chunk, shard)
-        tell = _Teller(one, len(mine), progress)
-        parts.append(_sweep_one(one, Shards(out, entry), mine, until_ci, tell, run_chunks, damaged))
+        tell, shards = _Teller(one, len(mine), progress), Shards(out, entry)
+        jobs.append((one, shards, mine, _missing(shards, mine, tell, damaged), tell))
+    # the next scenario compiles while this one runs
+    with ThreadPoolExecutor(COMPILERS) as pool:
+        compiling = [pool.submit(one.compile) if missing else None for one, _, _, missing, _ in jobs]
+        try:
+            parts = [
+                _sweep_one(*job, compiled, until_ci, run_chunks)
+                for job, compiled in zip(jobs, compiling, strict=True)
+            ]
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
     register(out, entries)  # once more: another sweep may have written the index at the same moment
     return SweepSummary(out, tuple(parts), tuple(damaged))
 
@@ -175,16 +189,8 @@ def _of_shard(seeds: list[int], chunk: int, shard: tuple[int, int] | None) -> li
     ]
 
 
-def _sweep_one(
-    episodes: Episodes,
-    shards: Shards,
-    seeds: list[int],
-    until_ci: tuple[float, str] | None,
-    tell: _Teller,
-    run_chunks: RunChunks,
-    damaged: list[str],
-) -> Part:
-    size = episodes.chunk
+def _missing(shards: Shards, seeds: list[int], tell: _Teller, damaged: list[str]) -> set[int]:
+    """Seeds that are not on disk; damaged files are set aside."""
     shards.clean()
     wanted, missing = frozenset(seeds), set(seeds)
     for chunk in shards.chunks():
@@ -196,14 +202,28 @@ def _sweep_one(
         missing.difference_update(found)
         mine = np.array([seed in wanted for seed in found], bool)
         tell.count(int(mine.sum()), {name: chunk.column(name)[mine] for name in _Teller.SUMS})
+    return missing
+
+
+def _sweep_one(
+    episodes: Episodes,
+    shards: Shards,
+    seeds: list[int],
+    missing: set[int],
+    tell: _Teller,
+    compiled: Future[None] | None,
+    until_ci: tuple[float, str] | None,
+    run_chunks: RunChunks,
+) -> Part:
+    size = episodes.chunk
     looks = _looks(len(seeds), size) if until_ci else [len(seeds)]
-    interval, reached, compiled, ran = None, False, False, 0
+    interval, reached, ran = None, False, 0
     for first, last in zip([0, *looks], looks, strict=False):
         todo = [seed for seed in seeds[first:last] if seed in missing]
-        if todo and not compiled:
+        if todo and compiled is not None:
             tell("compiling")
-            episodes.compile()
-            compiled = True
+            compiled.result()
+            compiled = None
             tell.begin()
         if todo:
             tell("running")
@@ -227,7 +247,7 @@ def _sweep_one(
                 break
     tell("finished")
     names = episodes.scenario, episodes.policy
-    return Part(*names, len(wanted), tell.done, ran, tell.elapsed, reached, interval)
+    return Part(*names, len(seeds), tell.done, ran, tell.elapsed, reached, interval)
 
 
 class _Teller:

@@ -83,6 +83,7 @@ class Command:
     trajectory: Trajectory | None = None
     control: Control | None = None
     meta: Int[Array, " E"] | None = None  # `Meta`, or -1: decide like the traffic
+    brake: Bool[Array, " N"] | None = None  # who brakes as hard as it can, egos or others
 
 
 class Tick(NamedTuple):
@@ -286,6 +287,8 @@ def _step(
     if command.meta is not None:
         told = meta_acceleration(jnp.maximum(command.meta, 0), state, a)
         a = at_slots(egos, told, a, ~egos.free & (command.meta >= 0))
+    if command.brake is not None:
+        a = jnp.where(command.brake, -state.driver.b_max, a)
     a = after_collision(state, a, traffic.after_collision)
     free = None
     if egos.slot.shape[0]:
@@ -296,7 +299,10 @@ def _step(
             control = command.control
         else:  # hands off
             control = Control(acceleration=jnp.zeros_like(egos.x), steering=jnp.zeros_like(egos.x))
-        wish = after_collision(state, control.acceleration, traffic.after_collision, egos.slot)
+        wish = control.acceleration
+        if command.brake is not None:
+            wish = jnp.where(command.brake[egos.slot], -traffic.limits.deceleration, wish)
+        wish = after_collision(state, wish, traffic.after_collision, egos.slot)
         control = replace(control, acceleration=wish)
         free = step_free(config, lane_map, traffic.limits, state, control)
         a = jnp.where(is_free(state), free.a, a)
