@@ -727,11 +727,13 @@ pasubio_tls.add.xml and every fourth vehicle.
   lane waits before it, maybe within the junction, for good. That is what jams ingolstadt1 (edge 164051413,
   8.9 m) and limsim_town05 (edge -28, 27 m).
 - SUMO's drivers choose the lane that leads on farthest, and so use all lanes of the roundabout. Ours stay on
-  the lane of their exit, three quarters of them on the outermost, and wait for one another.
+  the lane of their exit, four fifths of them on the outermost, and wait for one another.
 - limsim_bigInter jams in ours when vehicles that have entered on a gap meet others inside: priority is not
   transitive there (E0 yields to -E1, which yields to E2, whose path E0 blocks).
-- Red lights are crossed at walking pace: who comes to rest less than s0 before its stop may roll over the
-  line, and then drives on. Trucks (a = 1.3, b = 4) do, the others rarely.
+- Red lights are crossed in two ways. Who comes to rest less than s0 before its stop may roll over the line at
+  walking pace, and then drives on (trucks, with a = 1.3 and b = 4). And who begins to stop at yellow asks
+  again at every decision: the ACC-IDM brakes late, and where more than 3 m/s^2 is needed it drives on
+  (bologna_pasubio).
 - SUMO looks for collisions along lanes. Ours compares bodies, so it also finds those who touch beside
   one another where lanes come close, and on bridges those below (limsim_town05), for it has no heights.
 - Vehicles that stand for 300 s are teleported by SUMO. Ours stay, and hold up all behind them.
