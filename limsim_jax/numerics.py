@@ -31,6 +31,16 @@ def computed_once(tree: Tree) -> Tree:
         return _kept_apart(tree)
 
 
+def mapped_like(x: Array, tree: Tree) -> Tree:
+    """The same arrays, over which `vmap` maps if it maps over `x`: for what a scan starts from.
+
+    Constants there that the body replaces by mapped values make `vmap` trace the body once more, and four
+    times that of a scan within a scan.
+    """
+    first = jnp.ravel(x)[0]
+    return jax.tree.map(lambda y: jnp.where(first == first, y, y), tree)
+
+
 def safe_divide(
     numerator: Float[Array, "*#b"], denominator: Float[Array, "*#b"], default: float = 0.0
 ) -> Float[Array, "*#b"]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, turn_speed
 from limsim_jax.maps.signals import SignalState, lane_states
-from limsim_jax.numerics import computed_once
+from limsim_jax.numerics import computed_once, mapped_like
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
 from limsim_jax.traffic.collision import AfterCollision, after_collision
 from limsim_jax.traffic.collision import record as record_events
@@ -264,7 +264,7 @@ def drive(
         tick = Tick(state, left, config.time(state.step), decision, x, dx)
         return (bare(state), x), None if record is None else record(tick)
 
-    before, x = state, jnp.zeros_like(state.s)
+    before, x = state, mapped_like(state.s, jnp.zeros_like(state.s))
     (state, _), records = lax.scan(step, (bare(state), x), None, length=config.decision_every)
     state = replace(state, **fixed)
     if traffic.look_for_contacts == "decision":
