@@ -9,12 +9,16 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 Box = Float[Array, "5"]
 """x, y of the centre (m), heading (rad), length, width (m)."""
+
+_EIGHTH = math.tan(math.pi / 8)
+_ARC = (-0.33332949, 0.1997771, -0.13877679, 0.08053723)
 
 
 def wrap_angle(angle: Float[Array, "*#b"]) -> Float[Array, "*#b"]:
@@ -25,7 +29,32 @@ def wrap_angle(angle: Float[Array, "*#b"]) -> Float[Array, "*#b"]:
 def direction(dx: Float[Array, "*#b"], dy: Float[Array, "*#b"]) -> Float[Array, "*#b"]:
     """Angle of the vector (dx, dy) in [-pi, pi]; 0 with zero gradient for the zero vector."""
     zero = (dx == 0) & (dy == 0)
-    return jnp.where(zero, 0, jnp.arctan2(dy, jnp.where(zero, 1, dx)))
+    angle: Array = _arctan2(dy, jnp.where(zero, 1, dx))
+    return jnp.where(zero, 0, angle)
+
+
+@jax.custom_jvp
+def _arctan2(y: Any, x: Any) -> Array:
+    """As `jnp.arctan2` to 2e-7 rad. On CPUs that is a library call per number; this vectorises.
+
+    The arc tangent of the ratio, turned by 45 degrees where it is above tan(pi / 8), as an odd polynomial:
+    a minimax fit with a relative error of 2e-8.
+    """
+    steep = jnp.abs(y) > jnp.abs(x)
+    high, low = jnp.where(steep, jnp.abs(y), jnp.abs(x)), jnp.where(steep, jnp.abs(x), jnp.abs(y))
+    turn = low > _EIGHTH * high
+    t = jnp.where(turn, low - high, low) / jnp.where(turn, low + high, high)
+    z = t * t
+    angle = jnp.where(turn, math.pi / 4, 0) + (t + t * z * polynomial(_ARC, z))
+    angle = jnp.where(steep, math.pi / 2 - angle, angle)
+    angle = jnp.where(x < 0, math.pi - angle, angle)
+    return jnp.where(y < 0, -angle, angle)
+
+
+@_arctan2.defjvp
+def _arctan2_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
+    (y, x), (dy, dx) = primals, tangents
+    return _arctan2(y, x), (x * dy - y * dx) / (x * x + y * y)
 
 
 def polynomial(coefficients: Sequence[Any] | NDArray[Any], u: Any) -> Any:

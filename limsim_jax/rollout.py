@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from limsim_jax.maps.cache import directory
 from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.numerics import mapped_like
 from limsim_jax.policies.base import LikeTraffic, Policy
 from limsim_jax.traffic.collision import collided
 from limsim_jax.traffic.demand import delayed
@@ -175,7 +176,7 @@ class Rollout:
         """Before the first decision."""
         memory = self.policy.init(self.config, lane_map, state)
         measured = None if self.measure is None else self.measure.init(self.config, lane_map, state)
-        return Carry(state, memory, no_totals(state), measured)
+        return mapped_like(state.s, Carry(state, memory, no_totals(state), measured))
 
     def go_on(
         self,

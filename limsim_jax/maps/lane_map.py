@@ -38,7 +38,7 @@ from limsim_jax.maps.conflicts import ConflictTable, build_conflicts
 from limsim_jax.maps.network import ImportReport, Lane, LaneType, MapError, Network
 from limsim_jax.maps.routing import RouteTable, build_routes
 from limsim_jax.maps.signals import SignalTable, build_signals
-from limsim_jax.numerics import safe_divide, safe_sqrt
+from limsim_jax.numerics import computed_once, safe_divide, safe_sqrt
 
 NO_LANE = -1
 """Row of the null lane."""
@@ -311,7 +311,7 @@ def _locate(
     """Row of the interval that holds `s`, and arc length from its start, m."""
     ds = lane_map.ds[lane]
     index = jnp.clip(jnp.floor(s / ds).astype(jnp.int32), 0, lane_map.count[lane] - 1)
-    return lane_map.first[lane] + index, s - index.astype(s.dtype) * ds
+    return computed_once((lane_map.first[lane] + index, s - index.astype(s.dtype) * ds))
 
 
 def _inside(lane_map: LaneMap, row: Int[Array, "*#b"], u: Float[Array, "*#b"]) -> Float[Array, "*#b"]:

@@ -12,10 +12,11 @@ from typing import Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt
 
 from limsim_jax.geometry import box_corners
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, pose, project, side_s, to_frenet, width
+from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.ego import at_slots, body_place
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, State, Status
@@ -71,29 +72,41 @@ def contacts(box: Float[Array, "N 5"], active: Bool[Array, " N"]) -> Contacts:
     me = jnp.arange(n, dtype=jnp.int32)
     far = _FAR * (1 + me.astype(box.dtype))  # inactive ones are out of the reach of all, and of one another
     x, y, heading, length, breadth = (jnp.where(active, box[:, k], 0) for k in range(5))
-    bodies = _Bodies(x, y, jnp.cos(heading), jnp.sin(heading), length / 2, breadth / 2)
-    order, window = _sweep(bodies, active)
-    bodies = _Bodies(*(values[order] for values in bodies._replace(x=jnp.where(active, x, far))))
+    bodies = computed_once(_Bodies(x, y, jnp.cos(heading), jnp.sin(heading), length / 2, breadth / 2))
+    order, begin, end = _sweep(bodies, active)
+    bodies = bodies._replace(x=jnp.where(active, x, far))
+    bodies = computed_once(_Bodies(*(values[order] for values in bodies)))
     ring = _Bodies(*(jnp.concatenate([values, values]) for values in bodies))
 
-    def compare(step: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
-        nearest, least = found
-        for start in (step, n - step):  # the one `step` places after, and before
-            gap = _separation(bodies, _Bodies(*(lax.dynamic_slice(v, (start,), (n,)) for v in ring)))
-            closer = gap < least
-            nearest, least = jnp.where(closer, me + start, nearest), jnp.where(closer, gap, least)
-        return nearest, least
+    begin = jnp.concatenate([begin, jnp.full(n, 2**32 - 1, begin.dtype)])  # nobody follows the last
 
-    nobody = (jnp.full(n, -1, jnp.int32), jnp.full(n, REACH, box.dtype))
-    nearest, least = lax.fori_loop(1, jnp.minimum(window, n // 2) + 1, compare, nobody)
+    def meet(step: Array) -> Array:
+        # whether any two that are `step` places apart can; if none do, none that are farther apart do
+        return (step <= n // 2) & (lax.dynamic_slice(begin, (step,), (n,)) <= end).any()
+
+    def compare(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        step, _, nearest, least = carry
+        after = _Bodies(*(lax.dynamic_slice(v, (step,), (n,)) for v in ring))
+        gap = computed_once(_separation(bodies, after))  # the same from both
+        before = lax.dynamic_slice(jnp.concatenate([gap, gap]), (n - step,), (n,))
+        for start, gap_there in ((step, gap), (n - step, before)):
+            closer = gap_there < least
+            nearest, least = jnp.where(closer, me + start, nearest), jnp.where(closer, gap_there, least)
+        return step + 1, meet(step + 1), nearest, least
+
+    first = jnp.int32(1)
+    nobody = (first, meet(first), jnp.full(n, -1, jnp.int32), jnp.full(n, REACH, box.dtype))
+    _, _, nearest, least = lax.while_loop(lambda carry: carry[1], compare, nobody)
     nearest = jnp.where(nearest >= 0, order[nearest % n], -1)
     place = jnp.zeros(n, jnp.int32).at[order].set(me, unique_indices=True)
     nearest, least = nearest[place], least[place]
     return Contacts(jnp.where(least <= 0, nearest, -1), nearest, least)
 
 
-def _sweep(bodies: _Bodies, active: Bool[Array, " N"]) -> tuple[Int[Array, " N"], Int[Array, ""]]:
-    """Slots in order along the sweep, and how many places apart two bodies within `REACH` can stand.
+def _sweep(
+    bodies: _Bodies, active: Bool[Array, " N"]
+) -> tuple[Int[Array, " N"], UInt[Array, " N"], UInt[Array, " N"]]:
+    """Slots in order along the sweep, and where each begins and ends, in levels of the key.
 
     One integer holds place and slot: sorting those is ten times as fast as sorting pairs.
     """
@@ -120,11 +133,10 @@ def _sweep(bodies: _Bodies, active: Bool[Array, " N"]) -> tuple[Int[Array, " N"]
         return (jnp.clip(steps, -(top // 2), top // 2 - 1) + top // 2).astype(jnp.uint32)
 
     begin = jnp.where(active, level(middle - half), top)
-    end = jnp.where(active, level(middle + half), 0)
+    end = computed_once(jnp.where(active, level(middle + half), jnp.uint32(0)))
     key = lax.sort((begin << bits) | jnp.arange(n, dtype=jnp.uint32))
     order = (key & ((1 << bits) - 1)).astype(jnp.int32)
-    reach = jnp.searchsorted(key >> bits, end[order], side="right", method="scan_unrolled")
-    return order, jnp.max(reach.astype(jnp.int32) - 1 - jnp.arange(n, dtype=jnp.int32))
+    return computed_once((order, key >> bits, end[order]))
 
 
 def _separation(a: _Bodies, b: _Bodies) -> Float[Array, " N"]:
@@ -261,7 +273,7 @@ def record(config: Config, lane_map: LaneMap, state: State) -> State:
     Sets bits of `status`; `struck` and `struck_at` tell of the first contact only, and of the slot: a
     vehicle that enters there later is another one. Nobody is moved or removed.
     """
-    box = boxes(lane_map, state)
+    box = computed_once(boxes(lane_map, state))
     touched = contacts(box, state.active).other
     hit = touched >= 0
     first = hit & (state.struck < 0)
@@ -270,7 +282,7 @@ def record(config: Config, lane_map: LaneMap, state: State) -> State:
     status = state.status
     for which, bit in (
         (hit, Status.COLLIDED),
-        (off_road(lane_map, state, box), Status.OFF_ROAD),
+        (computed_once(off_road(lane_map, state, box)), Status.OFF_ROAD),
         (wrong_way(lane_map, state, box), Status.WRONG_WAY),
         (broken, Status.NOT_FINITE),
     ):

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, turn_speed
 from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.numerics import computed_once, mapped_like
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
 from limsim_jax.traffic.collision import AfterCollision, after_collision
 from limsim_jax.traffic.collision import record as record_events
@@ -120,6 +121,7 @@ def decide(
         jnp.stack([state.s, other_s, beside_s], -1),
         jnp.stack([order.rank[:n] + 1, order.rank[n:] + 1, place_of(order, lane_map, beside, beside_s)], -1),
     )
+    found = computed_once(found)
     own, second, new = (jax.tree.map(lambda x: x[:, k], found) for k in range(3))  # noqa: B023
     if traffic.lane_changes:
         choice = choose_lane(traffic.model, lane_map, state, v0, own, new, beside, beside_s, allowed, side)
@@ -131,6 +133,7 @@ def decide(
         choice = choice._replace(
             side=at_slots(state.egos, asked, choice.side, ~state.egos.free & (command.meta >= 0))
         )
+    choice = computed_once(choice)
     if traffic.lane_changes or command.meta is not None:
         state = start(lane_map, state, choice)
     rows = rows_ahead(config, lane_map, state, ahead)
@@ -262,7 +265,7 @@ def drive(
         tick = Tick(state, left, config.time(state.step), decision, x, dx)
         return (bare(state), x), None if record is None else record(tick)
 
-    before, x = state, jnp.zeros_like(state.s)
+    before, x = state, mapped_like(state.s, jnp.zeros_like(state.s))
     (state, _), records = lax.scan(step, (bare(state), x), None, length=config.decision_every)
     state = replace(state, **fixed)
     if traffic.look_for_contacts == "decision":

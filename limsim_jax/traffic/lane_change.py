@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
+from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
 from limsim_jax.traffic.motion import CREEP_SPEED
 from limsim_jax.traffic.neighbors import Pair
@@ -128,9 +129,15 @@ def choose_lane(
     to_go = routes.lanes_to_go[state.lane, state.goal]
     taper = (lane_map.length - lane_map.end_s)[state.lane]
     room = routes.change_distance[state.lane, state.goal] - taper - state.s
-    press = urgency(to_go, room, state.v, driver.lane_change_time)
+    press = computed_once(urgency(to_go, room, state.v, driver.lane_change_time))
     wanted = jnp.sign(to_go)
     reachable = routes.reachable[lane, state.goal]
+    # a lane on the wanted side may still lead nowhere: the change may be possible only further on
+    farther = routes.distance[lane, state.goal] > routes.distance[state.lane, state.goal]
+    back_to_go = routes.lanes_to_go[lane, state.goal]
+    back = routes.change_distance[lane, state.goal] - s
+    found = wanted, reachable, farther, back_to_go, back
+    wanted, reachable, farther, back_to_go, back = computed_once(found)
 
     # six accelerations in one call: who (i) follows whom (j, -1: free road) at what gap
     between = pair.lag_gap + shape.length + pair.lead_gap  # from the new follower to the new leader
@@ -143,17 +150,14 @@ def choose_lane(
         (own.lag, me, own.lag_gap),
         (own.lag, own.lead, around),
     ]
-    i, j, gap = (jnp.stack(column, -1) for column in zip(*cases, strict=True))
+    i, j, gap = (jnp.stack(column) for column in zip(*cases, strict=True))
     free = j < 0
-    accelerations = model(
-        jax.tree.map(lambda x: x[i], driver),
-        gap=jnp.where(free, NO_GAP, gap),
-        v=state.v[i],
-        v_lead=jnp.where(free, state.v[i], state.v[j]),
-        a_lead=jnp.where(free, 0, state.a[j]),
-        v0=v0[i],
-    )
-    own_now, own_then, new_now, new_then, old_now, old_then = (accelerations[:, k] for k in range(6))
+    who, v = jax.tree.map(lambda x: x[i], driver), state.v[i]
+    v_lead, a_lead = jnp.where(free, v, state.v[j]), jnp.where(free, 0, state.a[j])
+    gap = jnp.where(free, NO_GAP, gap)
+    who, gap, v, v_lead, a_lead, v_free = computed_once((who, gap, v, v_lead, a_lead, v0[i]))
+    accelerations = computed_once(model(who, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free))
+    own_now, own_then, new_now, new_then, old_now, old_then = (accelerations[k] for k in range(6))
     follower, old = pair.lag >= 0, own.lag >= 0
     advantage = incentive(
         own_now=own_now,
@@ -164,12 +168,11 @@ def choose_lane(
         old_then=jnp.where(old, old_then, 0),
         politeness=driver.politeness * (1 - press),
     )
-    # a lane on the wanted side may still lead nowhere: the change may be possible only further on
-    farther = routes.distance[lane, state.goal] > routes.distance[state.lane, state.goal]
     towards = (wanted == side) & ~farther
     with_route = jnp.where(towards, 1, jnp.where(wanted * side < 0, -1, 0)).astype(advantage.dtype)
     advantage += with_route * (ROUTE_BASE + ROUTE_URGENT * press)
     advantage -= side.astype(advantage.dtype) * driver.keep_right
+    advantage = computed_once(advantage)
 
     # safety (eq. 2): nobody has to brake harder than b_safe, and there is room
     b_safe = driver.b_safe + SAFE_URGENT * press
@@ -177,16 +180,16 @@ def choose_lane(
         (pair.lead < 0) | ((own_then > -b_safe) & (pair.lead_gap > ROOM))
     )
     # a change away from the route must leave time to come back, and none is begun that the lane cannot hold
-    back_to_go = routes.lanes_to_go[lane, state.goal]
     away = (wanted * side < 0) | ((wanted == side) & farther) | ((wanted == 0) & (back_to_go != 0))
-    back = routes.change_distance[lane, state.goal] - s
     count = jnp.abs(back_to_go).astype(back.dtype)
     late = away & (back < 3 * jnp.maximum(state.v, SLOWEST) * driver.lane_change_time * (count + 1))
     rested = (state.rest <= 0) | (press > 0)
     starts = allowed & reachable & safe & ~late & rested & (advantage > driver.threshold)
 
-    # courtesy: the vehicle that would be the new follower of somebody in need lets it in
     asks = towards & (press > COURTEOUS) & allowed & follower & ~starts
+    starts, asks = computed_once((starts, asks))
+
+    # courtesy: the vehicle that would be the new follower of somebody in need lets it in
     n = me.shape[0]
     letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(asks, pair.lag, n)].max(me)[:n]
     letting_gap = jnp.where(letting >= 0, pair.lag_gap[letting], NO_GAP)

@@ -6,6 +6,7 @@ gap now is that gap plus what the obstacle has travelled since, less what the ve
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,9 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from limsim_jax.geometry import polynomial
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, width
-from limsim_jax.numerics import safe_divide
-from limsim_jax.traffic.car_following import NO_GAP, CarFollowing, ballistic, per_obstacle
+from limsim_jax.numerics import computed_once, safe_divide
+from limsim_jax.traffic.car_following import NO_GAP, CarFollowing, ballistic
 from limsim_jax.traffic.ego import overlay_boxes
 from limsim_jax.traffic.neighbors import Obstacles
 from limsim_jax.types import Config, State, Status
@@ -26,7 +28,8 @@ WALKING_SPEED = 1.5
 CREEP_SPEED = 5.0
 """m/s, below which a lane change goes on by distance, not by time: what stands does not slide."""
 
-_MOST_TURNED = 0.2  # rad against the lane in a lane change: the ends of long bodies stay near theirs
+_STEEPEST = math.tan(0.2)  # way against the lane in a lane change: the ends of long bodies stay near theirs
+_GOAL = -2  # in place of the next lane, at the end of a goal
 _HAND_OVERS = 3  # lanes that a vehicle may leave behind in one step
 _APPROACH = 0.7  # of the comfortable deceleration: used to slow down for a bend ahead
 
@@ -53,23 +56,23 @@ def accelerations(
 ) -> Float[Array, " N"]:
     """Acceleration (m/s^2) of every vehicle, `x` m after the decision: the least that any obstacle asks."""
     driver = state.driver
-    index, gap0 = decision.obstacles
+    index, gap0 = (x.T for x in decision.obstacles)  # vehicles last: XLA vectorises along their axis
     moving = index >= 0
 
     def seen(index: Int[Array, "*b"], value: Float[Array, " N"]) -> Float[Array, "*b"]:
         return jnp.where(index >= 0, value[index], 0)
 
     none = (gap0 >= NO_GAP) | (moving & ~state.active[index])  # who leaves the map is no obstacle
-    gap = jnp.where(none, NO_GAP, gap0 + seen(index, x) - x[:, None])
-    v_lead = jnp.where(none, state.v[:, None], seen(index, state.v))
+    gap = jnp.where(none, NO_GAP, gap0 + seen(index, x) - x[None])
+    v_lead = jnp.where(none, state.v[None], seen(index, state.v))
     a_lead = jnp.where(moving, seen(index, state.a), 0)
+    gap, v_lead, a_lead = computed_once((gap, v_lead, a_lead))
     # slow down in time for what comes: the speed from which `v_ahead` is reached with a part of b
     room = jnp.maximum(decision.ahead - x, 0)
     reach = jnp.sqrt(decision.v_ahead**2 + 2 * _APPROACH * driver.b * room + 1e-6)
     v0 = jnp.minimum(decision.v0, reach)
-    a = model(
-        per_obstacle(driver), gap=gap, v=state.v[:, None], v_lead=v_lead, a_lead=a_lead, v0=v0[:, None]
-    ).min(-1)
+    each, v, v_free = jax.tree.map(lambda value: value[None], (driver, state.v, v0))
+    a = model(each, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free).min(0)
     polite = (decision.courtesy >= 0) & state.active[decision.courtesy]
     gap = jnp.where(polite, decision.courtesy_gap + seen(decision.courtesy, x) - x, NO_GAP)
     v_lead = jnp.where(polite, seen(decision.courtesy, state.v), state.v)
@@ -89,10 +92,10 @@ def advance(
     Returns the state, the distance that each travelled (m), and who has left at the end of its goal.
     """
     a = jnp.where(state.active, a, 0)
-    v, dx = ballistic(state.v, a, config.dt)
+    v, dx = computed_once(ballistic(state.v, a, config.dt))
     realised = (v - state.v) / config.dt
     hard = realised < -state.driver.b_max - 0.01
-    lane, previous, s, left = _hand_over(lane_map, state, state.s + dx)
+    lane, previous, s, left = _hand_over(lane_map, state, computed_once(state.s + dx))
     state = replace(
         state,
         lane=jnp.where(left, NO_LANE, lane),
@@ -113,18 +116,21 @@ def _hand_over(
     lane_map: LaneMap, state: State, s: Float[Array, " N"]
 ) -> tuple[Int[Array, " N"], Int[Array, " N"], Float[Array, " N"], Bool[Array, " N"]]:
     """Pass vehicles beyond the end of their lane on to the next one of their route."""
+    routes = lane_map.routes
+    way = jnp.where(routes.is_goal, _GOAL, routes.next_lane)  # one look-up instead of two
     lane, previous = state.lane, state.previous
     left = jnp.zeros_like(state.active)
     for _ in range(_HAND_OVERS):
         length = lane_map.length[lane]
         over = state.active & (s > length) & ~left
-        following = lane_map.routes.next_lane[lane, state.goal]
-        gone = over & lane_map.routes.is_goal[lane, state.goal]
-        go_on = over & ~gone & (following != NO_LANE)
+        following = way[lane, state.goal]
+        gone = over & (following == _GOAL)
+        go_on = over & (following >= 0)
         left = left | gone
         previous = jnp.where(go_on, lane, previous)
         s = jnp.where(go_on, s - length, s)
         lane = jnp.where(go_on, following, lane)
+        lane, previous, s, left = computed_once((lane, previous, s, left))
     return lane, previous, s, left
 
 
@@ -166,6 +172,7 @@ def _move_sideways(config: Config, lane_map: LaneMap, state: State) -> State:
     d = jnp.where(state.crossed, offset, offset + side * between)
     crosses = changing & ~state.crossed & (side * d > own_width / 2) & (beside != NO_LANE)
     finished = changing & (progress >= 1) & (state.crossed | crosses)
+    crosses, finished, d, s_beside = computed_once((crosses, finished, d, s_beside))
     return replace(
         state,
         lane=jnp.where(crosses, beside, state.lane),
@@ -203,6 +210,7 @@ def boxes(lane_map: LaneMap, state: State) -> Float[Array, "N 5"]:
     lane = jnp.where(behind, state.previous, state.lane)
     s = jnp.where(behind, s + lane_map.length[state.previous], s)
     x, y, heading = pose(lane_map, lane, s, state.d)
-    turned = jnp.arctan2(lateral_speed(state), jnp.maximum(state.v, 0.5))
-    turned = jnp.clip(turned, -_MOST_TURNED, _MOST_TURNED)
-    return overlay_boxes(state, jnp.stack([x, y, heading + turned, shape.length, shape.width], -1))
+    slope = jnp.clip(lateral_speed(state) / jnp.maximum(state.v, 0.5), -_STEEPEST, _STEEPEST)
+    turned = slope * polynomial((1, -1 / 3, 1 / 5, -1 / 7), slope * slope)  # the arc tangent, to 1e-7
+    x, y, heading = computed_once((x, y, heading + turned))
+    return overlay_boxes(state, jnp.stack([x, y, heading, shape.length, shape.width], -1))

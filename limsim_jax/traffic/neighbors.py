@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, UInt
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s
+from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.types import Config, State
 
@@ -162,9 +163,10 @@ def _entry(
 ) -> tuple[Int[Array, "*b"], Float[Array, "*b"]]:
     """Vehicle and s of the entry at `position`; vehicle -1 if there is none there on `lane`."""
     last = order.key.shape[0] - 1
-    place = jnp.clip(position, 0, last)
-    there = (position >= 0) & (position <= last) & (order.lane[place] == lane) & (lane != NO_LANE)
-    return jnp.where(there, order.vehicle[place], -1), order.s[place]
+    place = computed_once(jnp.clip(position, 0, last))
+    there, vehicle, s = computed_once((order.lane[place], order.vehicle[place], order.s[place]))
+    there = (position == place) & (there == lane) & (lane != NO_LANE)
+    return jnp.where(there, vehicle, -1), s
 
 
 @jax.named_scope("neighbors")
@@ -186,8 +188,10 @@ def neighbors(
     lane, else on the last stretch of two of its predecessors. The vehicle itself does not count.
     Without a lane there is nobody.
     """
-    me = jnp.arange(lane.shape[0], dtype=jnp.int32)[:, None]
-    goal = jnp.broadcast_to(state.goal[:, None], lane.shape)
+    # vehicles last: their axis is the long one, along which XLA vectorises
+    lane, s, here = lane.T, s.T, here.T
+    me = jnp.arange(lane.shape[-1], dtype=jnp.int32)[None]
+    goal = jnp.broadcast_to(state.goal[None], lane.shape)
     length = state.shape.length
 
     lanes, starts = [], []
@@ -199,8 +203,8 @@ def neighbors(
         lanes.append(after)
         starts.append(start)
         start = start + lane_map.length[after]
-    ahead, offset = jnp.stack(lanes, -1), jnp.stack(starts, -1)  # [N, K, D]
-    behind = lane_map.predecessors[lane][..., :_UPSTREAM]  # [N, K, P]
+    ahead, offset = jnp.stack(lanes), jnp.stack(starts)  # [D, K, N]
+    behind = jnp.stack([lane_map.predecessors[lane, k] for k in range(_UPSTREAM)])  # [P, K, N]
     first, last = order.first[ahead], order.last[behind]
 
     # leader: the next entry that is not oneself, else the last vehicle of the lanes that follow
@@ -210,12 +214,14 @@ def neighbors(
     lead, lead_at = jnp.where(skip, vehicle2, vehicle), jnp.where(skip, position2, position) - s
     vehicle, position = _entry(order, first, ahead)
     vehicle2, position2 = _entry(order, first + 1, ahead)
-    skip = vehicle == me[..., None]
-    vehicle, position = jnp.where(skip, vehicle2, vehicle), jnp.where(skip, position2, position)
+    skip = vehicle == me[None]
+    vehicle, position = jnp.where(skip, vehicle2, vehicle), offset + jnp.where(skip, position2, position)
+    vehicle, position = computed_once((vehicle, position))
     for k in range(config.look_ahead_lanes):
-        new = (lead < 0) & (vehicle[..., k] >= 0)
-        lead = jnp.where(new, vehicle[..., k], lead)
-        lead_at = jnp.where(new, offset[..., k] + position[..., k], lead_at)
+        new = (lead < 0) & (vehicle[k] >= 0)
+        lead = jnp.where(new, vehicle[k], lead)
+        lead_at = jnp.where(new, position[k], lead_at)
+    lead, lead_at = computed_once((lead, lead_at))
     lead_gap = lead_at - length[lead]
     lead = jnp.where(lead_gap < config.look_ahead, lead, -1)
 
@@ -225,16 +231,17 @@ def neighbors(
     skip = vehicle == me
     lag, lag_at = jnp.where(skip, vehicle2, vehicle), s - jnp.where(skip, position2, position)
     vehicle, position = _entry(order, last, behind)
-    vehicle = jnp.where(vehicle == me[..., None], -1, vehicle)
-    distance = s[..., None] + lane_map.length[behind] - position
+    vehicle = jnp.where(vehicle == me[None], -1, vehicle)
+    distance = s[None] + lane_map.length[behind] - position
     distance = jnp.where(vehicle >= 0, distance, NO_GAP)
-    nearest = jnp.argmin(distance, -1)[..., None]
     upstream = (lag < 0) & (lane != NO_LANE)
-    lag = jnp.where(upstream, jnp.take_along_axis(vehicle, nearest, -1)[..., 0], lag)
-    lag_at = jnp.where(upstream, jnp.take_along_axis(distance, nearest, -1)[..., 0], lag_at)
-    return Pair(
+    for k in range(_UPSTREAM):
+        nearer = upstream & ((distance[k] < lag_at) | (k == 0))
+        lag, lag_at = jnp.where(nearer, vehicle[k], lag), jnp.where(nearer, distance[k], lag_at)
+    found = Pair(
         lead,
         jnp.where(lead >= 0, lead_gap, NO_GAP),
         lag,
-        jnp.where(lag >= 0, lag_at - length[:, None], NO_GAP),
+        jnp.where(lag >= 0, lag_at - length[None], NO_GAP),
     )
+    return Pair(*(x.T for x in found))

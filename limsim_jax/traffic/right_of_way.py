@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, turn_speed
 from limsim_jax.maps.signals import SignalState
+from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.neighbors import Ahead, Pair, Shelf
 from limsim_jax.types import Config, Driver, State
@@ -227,52 +228,55 @@ def _meet(
     def share(k: Array, x: Array) -> Array:
         return (x + _BEHIND) / (table.length[k] + _BEHIND)
 
+    entries = computed_once(entries)
     order, entry = shelf.sort(connector, share(connector, entries.y - entries.length))
 
     # which conflicts matter
     k = rows.connector
     busy = jnp.zeros(size, bool).at[jnp.where(connector < 0, size, connector)].set(True, mode="drop")
     reach = rows.x + (state.v * state.v / (2 * _EASY) + 1.5 * state.v + 12)[:, None]
-    near = (table.s_in[k] < reach[..., None]) & (table.s_out[k] > (rows.x - sight.length)[..., None])
-    matters = (near & busy[table.foe[k]] & (table.foe[k] >= 0) & (k >= 0)[..., None]).reshape(
-        n * _ROWS, slots
-    )
-    number = matters.sum(-1, dtype=jnp.int32)
+    s_in, s_out, foe = (x.T[:, k.ravel()] for x in (table.s_in, table.s_out, table.foe))  # [C, N R]
+    matters = (s_in < reach.ravel()[None]) & (s_out > (rows.x - sight.length).ravel()[None])
+    matters &= busy[foe] & (foe >= 0) & (k >= 0).ravel()[None]
+    matters = computed_once(matters)
+    number = matters.sum(0, dtype=jnp.int32)
     begin = jnp.cumsum(number) - number
     most = _PAIRS * n
     pair = jnp.arange(most, dtype=jnp.int32)
     row = jnp.searchsorted(begin, pair, side="right", method="scan_unrolled").astype(jnp.int32) - 1
-    upto = matters.astype(jnp.float32) @ jnp.triu(jnp.ones((slots, slots), jnp.float32))
-    nth = (pair - begin[row]).astype(jnp.float32)
-    c = (upto[row] <= nth[:, None]).sum(-1, dtype=jnp.int32)
+    row = computed_once(row)
+    nth, upto, c = pair - begin[row], jnp.zeros_like(row), jnp.zeros_like(row)
+    for slot in range(slots):
+        upto += matters[slot, row].astype(jnp.int32)
+        c += (upto <= nth).astype(jnp.int32)
     exists = (pair < begin[-1] + number[-1]) & (c < slots)
     c = jnp.minimum(c, slots - 1)
-    vehicle, k = row // _ROWS, k.ravel()[row]
+    vehicle, k, c = computed_once((row // _ROWS, k.ravel()[row], c))
     missed = (number > 0) & (begin + number > most)  # no room in the list: better wait
 
     # for each: the vehicles on the foe that have not cleared the stretch, the nearest first
     foe, kind = table.foe[k, c], table.type[k, c]
-    s_in, s_out, f_in, f_out = (x[k, c][:, None] for x in (table.s_in, table.s_out, table.f_in, table.f_out))
-    splits, merges = (kind == ConflictType.DIVERGE)[:, None], (kind == ConflictType.MERGE)[:, None]
-    me = _Sight(*(x.ravel()[row][:, None] for x in sight))
-    wanted = shelf.key(foe, share(foe, jnp.where(splits, me.y, f_out)[:, 0]))
-    place = shelf.first_from(order, wanted)[:, None]
-    place = place + jnp.where(splits, jnp.arange(_FOES) - 1, -1 - jnp.arange(_FOES))
-    index = entry[jnp.clip(place, 0, count - 1)]  # [P, Q]
-    there = (place >= 0) & (place < count) & (connector[index] == foe[:, None]) & exists[:, None]
-    other = _Sight(*(x[index] for x in entries))
+    s_in, s_out, f_in, f_out = (x[k, c][None] for x in (table.s_in, table.s_out, table.f_in, table.f_out))
+    splits, merges = (kind == ConflictType.DIVERGE)[None], (kind == ConflictType.MERGE)[None]
+    me = computed_once(_Sight(*(x.ravel()[row][None] for x in sight)))
+    wanted = shelf.key(foe, share(foe, jnp.where(splits, me.y, f_out)[0]))
+    q = jnp.arange(_FOES)[:, None]
+    place = shelf.first_from(order, wanted)[None] + jnp.where(splits, q - 1, -1 - q)
+    index = computed_once(entry[jnp.clip(place, 0, count - 1)])  # [Q, P]
+    there = (place >= 0) & (place < count) & (connector[index] == foe[None]) & exists[None]
+    other = computed_once(_Sight(*(x[index] for x in entries)))
     there &= other.slot != me.slot
 
     mine, theirs = _Way(s_in, s_out), _Way(f_in, f_out)
     gaps = _gap(driver, state)
     first = _goes_first(
-        me, mine, gaps[vehicle][:, None], other, theirs, gaps[other.slot.astype(jnp.int32)],
-        table.prio[k, c][:, None], table.tie[k, c][:, None], merges,
+        me, mine, gaps[vehicle][None], other, theirs, gaps[other.slot.astype(jnp.int32)],
+        table.prio[k, c][None], table.tie[k, c][None], merges,
     )  # fmt: skip
 
     distance_in = s_in - me.y
     past = s_out + me.length - me.y <= 0
-    waits = there & ~first & ~past & ~splits
+    waits = computed_once(there & ~first & ~past & ~splits)
     # a vehicle that clears the stretch before one comes there needs no care
     way = f_out + other.length - other.y
     out = travel_time(way, jnp.minimum(other.v, other.slow), other.slow, 0.7 * other.a)
@@ -280,16 +284,17 @@ def _meet(
     waits &= ~((out + GAP_FOLLOW < soon) & (other.stuck == 0) & ~merges)
     # merging: behind the other where there is room behind it, and where that asks for less than to stop
     behind = (s_out - me.y) - (f_out - other.y + other.length)
-    s0, T, b = (x[vehicle][:, None] for x in (driver.s0, driver.T, driver.b))
+    s0, T, b = (x[vehicle][None] for x in (driver.s0, driver.T, driver.b))
     reach = behind + other.v * other.v / (2 * b)
     eases = (behind > s0 + 0.5 * T * me.v) & (reach > distance_in)
     follows = waits & merges & (eases | (distance_in <= -_MARGIN))
     # keep clear: nobody enters behind a slow vehicle only to stand where others cross
-    clear = (table.cross_s[k][:, None] - me.y) + me.length + s0
-    stands = (table.cross_s[k][:, None] > 0) & (me.line > -_MARGIN) & (other.v < 2 * _STANDS)
+    clear = (table.cross_s[k][None] - me.y) + me.length + s0
+    stands = (table.cross_s[k][None] > 0) & (me.line > -_MARGIN) & (other.v < 2 * _STANDS)
     follows &= ~(stands & (behind < clear))
-    taken = (waits & ~follows).any(-1)
-    until = jnp.where(taken, distance_in[:, 0], NO_GAP)
+    waits, follows = computed_once((waits, follows))
+    taken = (waits & ~follows).any(0)
+    until = jnp.where(taken, distance_in[0], NO_GAP)
     until = jnp.full(n * _ROWS, NO_GAP, jnp.float32).at[row].min(until)
     until = jnp.where(missed, jnp.minimum(until, 0), until).reshape(n, _ROWS)
 
@@ -297,8 +302,12 @@ def _meet(
     in_front = there & splits & (other.y > jnp.maximum(me.y, 0)) & (other.y - other.length < f_out) & ~past
     gap = jnp.where(follows, behind, jnp.where(in_front, other.y - other.length - me.y, NO_GAP))
     need = jnp.where(gap < NO_GAP, gap + other.v * other.v / (2 * b), 2 * NO_GAP)
-    nearest = jnp.argmin(need, -1)[:, None]
-    gap, need, slot = (jnp.take_along_axis(x, nearest, -1)[:, 0] for x in (gap, need, other.slot))
+    gap, need = computed_once((gap, need))
+    best = gap[0], need[0], other.slot[0]
+    for i in range(1, _FOES):
+        nearer = need[i] < best[1]
+        best = tuple(jnp.where(nearer, x[i], y) for x, y in zip((gap, need, other.slot), best, strict=True))
+    gap, need, slot = computed_once(best)
     least = jnp.full(n, 2 * NO_GAP, jnp.float32).at[vehicle].min(need)
     chosen = (need == least[vehicle]) & (need < NO_GAP)
     which = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(chosen, vehicle, n)].max(pair)[:n]
@@ -334,7 +343,9 @@ def _goes_first(
     in_me, in_foe = mine.start - me.y, theirs.start - foe.y
     level_me = (in_me <= -_MARGIN).astype(jnp.int32) + (in_me < me.brake).astype(jnp.int32)
     level_foe = (in_foe <= -_MARGIN).astype(jnp.int32) + (in_foe < foe.brake).astype(jnp.int32)
-    soon_me, soon_foe = travel_time(in_me, me.v, me.fast, me.a), travel_time(in_foe, foe.v, foe.fast, foe.a)
+    soon_me, soon_foe = computed_once(
+        (travel_time(in_me, me.v, me.fast, me.a), travel_time(in_foe, foe.v, foe.fast, foe.a))
+    )
     before = me.slot < foe.slot
     # both inside, or both unable to stop: who is further on
     left_me, left_foe = mine.end - me.y, theirs.end - foe.y
@@ -343,6 +354,7 @@ def _goes_first(
     forced = jnp.where(level_me == 2, nearer, sooner)
 
     # between those who can still choose: who has priority
+    forced, sooner, level_me, level_foe = computed_once((forced, sooner, level_me, level_foe))
     longer = jnp.where(me.wait == foe.wait, sooner, me.wait > foe.wait)
     both = jnp.minimum(me.wait, foe.wait)
     rank = jnp.where((tie != 0) & (both < WAITED), tie > 0, longer)
@@ -353,6 +365,7 @@ def _goes_first(
     # and whether the other has the time to pass before
     i_pass = _passes(me, mine, gap_me, foe, soon_foe, merges)
     foe_passes = _passes(foe, theirs, gap_foe, me, soon_me, merges)
+    i_pass, foe_passes = computed_once((i_pass, foe_passes))
     free = jnp.where(major, ~foe_passes, i_pass)
     return jnp.where(level_me != level_foe, level_me > level_foe, jnp.where(level_me > 0, forced, free))
 
