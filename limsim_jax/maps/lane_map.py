@@ -197,10 +197,14 @@ def turn_speed(lane_map: LaneMap, lane: Index, lateral_acceleration: Number) -> 
 
     SUMO limits junctions by 5.5 m/s^2; comfortable driving stays within 2 to 3 m/s^2.
     """
-    limit = lane_map.speed_limit[lane]
+    return jnp.minimum(bend_speed(lane_map, lane, lateral_acceleration), lane_map.speed_limit[lane])
+
+
+def bend_speed(lane_map: LaneMap, lane: Index, lateral_acceleration: Number) -> Float[Array, "*#b"]:
+    """Speed (m/s) at which the tightest bend takes this lateral acceleration (m/s^2); 1e6 if straight."""
     bend = lane_map.curvature_max[lane]
     speed = safe_sqrt(safe_divide(_as_float(lane_map, lateral_acceleration), bend))
-    return jnp.where(bend > 0, jnp.minimum(speed, limit), limit)
+    return jnp.where(bend > 0, speed, 1e6)
 
 
 def to_frenet(

@@ -29,6 +29,10 @@ FAR = 1e9
 CHANGE_PENALTY = 30.0
 """Metres of detour that are preferred to one lane change."""
 
+ROOM_TO_CHANGE, SHORT_PENALTY = 30.0, 300.0
+"""m: a lane shorter than the first is a bad place to change lanes; to changing on one of no length at all, a
+detour of the second is preferred."""
+
 TOLERANCE = 5.0
 """Metres by which lanes that lead to the same place may differ in length and still be equally good."""
 
@@ -355,7 +359,9 @@ class _LaneGraph:
         # Reversed links, and from every goal (a node of its own) to the ends of its lanes.
         row, goal = np.nonzero(is_goal)
         links = np.concatenate([ahead, self.left, self.right, np.column_stack([row, size + goal])])
-        changes = np.full(len(self.left) + len(self.right), max(change_penalty, 1e-6))
+        # where a lane is too short to change on, earlier is better
+        room = self.length[np.concatenate([self.left, self.right])[:, 0]]
+        changes = max(change_penalty, 1e-6) + SHORT_PENALTY * np.clip(1 - room / ROOM_TO_CHANGE, 0, 1)
         costs = np.concatenate([self.cost[ahead[:, 0]], changes, self.cost[row]])
         graph = _matrix(links[:, ::-1], np.maximum(costs, 1e-6), size + count)
         cost = np.full((size, count), np.inf)

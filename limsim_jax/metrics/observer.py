@@ -19,7 +19,7 @@ from limsim_jax.metrics.episode import EgoCarry, EgoMetrics, EgoStep
 from limsim_jax.metrics.reductions import Measured
 from limsim_jax.metrics.safety import NO_GAP, Rss, Zones
 from limsim_jax.metrics.traffic import Detectors, TrafficCarry, TrafficMetrics, TrafficStep
-from limsim_jax.traffic.collision import off_road
+from limsim_jax.traffic.collision import CLEARANCE, level, off_road
 from limsim_jax.traffic.ego import arrived, body_place
 from limsim_jax.traffic.engine import Tick
 from limsim_jax.traffic.motion import boxes
@@ -155,6 +155,8 @@ def _look(
     """All that needs no memory; who leads the ego, and where it wants to go, is filled in later."""
     slot = state.egos.slot[0]
     box = boxes(lane_map, state)
+    z = level(lane_map, state)
+    seen = state.active & (jnp.abs(z - z[slot]) < CLEARANCE)  # who is on a bridge is out of reach
     lane, s, v = state.lane[slot], state.s[slot], state.v[slot]
     routes, table = lane_map.routes, lane_map.conflicts
     shows = lane_states(lane_map.signals, state.lights.phase)
@@ -181,7 +183,7 @@ def _look(
     sides = [lane, lane_map.left[lane], lane_map.right[lane]]
     sides += [lane_map.left[sides[1]], lane_map.right[sides[2]], following]
     near = (state.lane[:, None] == jnp.stack(sides)[None]) & (state.lane != NO_LANE)[:, None]
-    near = near.any(-1) & state.active & (jnp.arange(state.lane.shape[0]) != slot)
+    near = near.any(-1) & seen & (jnp.arange(state.lane.shape[0]) != slot)
     count = jnp.sum(near, dtype=state.v.dtype)
     direction = jnp.stack([jnp.cos(box[:, 2]), jnp.sin(box[:, 2])], -1)
     at_goal = arrived(lane_map, state)[0]
@@ -190,9 +192,9 @@ def _look(
         t=t,
         box=box,
         velocity=state.v[:, None] * direction,
-        active=state.active,
+        active=seen,
         b_max=state.driver.b_max,
-        relevant=state.active,
+        relevant=seen,
         changing=(state.side != 0) | straddles | off,
         violation=ran | wrong,
         slot=slot,

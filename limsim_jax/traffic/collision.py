@@ -15,7 +15,17 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 from limsim_jax.geometry import box_corners
-from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, pose, project, side_s, to_frenet, width
+from limsim_jax.maps.lane_map import (
+    NO_LANE,
+    LaneMap,
+    curvature,
+    elevation,
+    pose,
+    project,
+    side_s,
+    to_frenet,
+    width,
+)
 from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.ego import at_slots, body_place
 from limsim_jax.traffic.motion import boxes
@@ -37,6 +47,10 @@ _FAR = 1e9  # m
 _CLOSE = 4.0  # m: a corner that is farther from the centre is looked up in the map
 
 
+CLEARANCE = 3.0
+"""m between the roads on and below a bridge, from which vehicles on them cannot touch."""
+
+
 class Contacts(NamedTuple):
     """The nearest other body of every vehicle."""
 
@@ -54,10 +68,13 @@ class _Bodies(NamedTuple):
     sin: Array
     length: Array  # m, halves
     width: Array
+    z: Array  # m
 
 
 @jax.named_scope("contacts")
-def contacts(box: Float[Array, "N 5"], active: Bool[Array, " N"]) -> Contacts:
+def contacts(
+    box: Float[Array, "N 5"], active: Bool[Array, " N"], z: Float[Array, " N"] | None = None
+) -> Contacts:
     """The nearest body of every vehicle and whether they touch, exact for any number of vehicles.
 
     Sweep and prune: bodies are sorted by where they begin along one direction, and each is compared with
@@ -65,6 +82,8 @@ def contacts(box: Float[Array, "N 5"], active: Bool[Array, " N"]) -> Contacts:
     result depends on no list length; only the time depends on how dense the traffic is. The comparison is
     the separating-axis test. Bodies with numbers that are not finite touch nobody. Without gradient: that
     of `geometry.box_separation` to `nearest` is meaningful.
+
+    `z`: m, elevation; bodies more than `CLEARANCE` apart in height are out of reach.
     """
     n = box.shape[0]
     box = lax.stop_gradient(box)
@@ -72,7 +91,8 @@ def contacts(box: Float[Array, "N 5"], active: Bool[Array, " N"]) -> Contacts:
     me = jnp.arange(n, dtype=jnp.int32)
     far = _FAR * (1 + me.astype(box.dtype))  # inactive ones are out of the reach of all, and of one another
     x, y, heading, length, breadth = (jnp.where(active, box[:, k], 0) for k in range(5))
-    bodies = computed_once(_Bodies(x, y, jnp.cos(heading), jnp.sin(heading), length / 2, breadth / 2))
+    z = jnp.zeros_like(x) if z is None else jnp.where(active, lax.stop_gradient(z), 0)
+    bodies = computed_once(_Bodies(x, y, jnp.cos(heading), jnp.sin(heading), length / 2, breadth / 2, z))
     order, begin, end = _sweep(bodies, active)
     bodies = bodies._replace(x=jnp.where(active, x, far))
     bodies = computed_once(_Bodies(*(values[order] for values in bodies)))
@@ -150,7 +170,8 @@ def _separation(a: _Bodies, b: _Bodies) -> Float[Array, " N"]:
         jnp.abs(b.cos * dx + b.sin * dy) - (b.length + c * a.length + s * a.width),
         jnp.abs(b.cos * dy - b.sin * dx) - (b.width + s * a.length + c * a.width),
     ]
-    return jnp.maximum(jnp.maximum(gaps[0], gaps[1]), jnp.maximum(gaps[2], gaps[3]))
+    gap = jnp.maximum(jnp.maximum(gaps[0], gaps[1]), jnp.maximum(gaps[2], gaps[3]))
+    return jnp.maximum(gap, jnp.where(jnp.abs(a.z - b.z) > CLEARANCE, REACH, -_FAR))
 
 
 # ---- the road
@@ -274,7 +295,7 @@ def record(config: Config, lane_map: LaneMap, state: State) -> State:
     vehicle that enters there later is another one. Nobody is moved or removed.
     """
     box = computed_once(boxes(lane_map, state))
-    touched = contacts(box, state.active).other
+    touched = contacts(box, state.active, level(lane_map, state)).other
     hit = touched >= 0
     first = hit & (state.struck < 0)
     numbers = jnp.stack([state.s, state.d, state.v, state.a], -1)
@@ -293,6 +314,11 @@ def record(config: Config, lane_map: LaneMap, state: State) -> State:
         struck=jnp.where(first, touched, state.struck),
         struck_at=jnp.where(first, config.time(state.step), state.struck_at),
     )
+
+
+def level(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
+    """Elevation of the road under every vehicle, m: who is on a bridge touches nobody below."""
+    return elevation(lane_map, state.lane, state.s)[0]
 
 
 def collided(state: State) -> Bool[Array, ""]:

@@ -29,11 +29,11 @@ from limsim_jax.maps.lane_map import (
     NO_LANE,
     VEHICLE_CLASSES,
     LaneMap,
+    bend_speed,
     bucket,
     curvature,
     lane_ids,
     lane_rows,
-    turn_speed,
 )
 from limsim_jax.maps.network import Lane, Network
 from limsim_jax.numerics import safe_sqrt
@@ -870,7 +870,7 @@ def entry_speed(
         stop = jnp.minimum(stop, jnp.where(wall, end - _WALL_ROOM, _FAR))
         square = jnp.minimum(square, brake * jnp.maximum(stop, 0))
         slow = jnp.minimum(
-            driver.speed_factor * lane_map.speed_limit[after], turn_speed(lane_map, after, driver.a_lat)
+            driver.speed_factor * lane_map.speed_limit[after], bend_speed(lane_map, after, driver.a_lat)
         )
         slow = jnp.where(after == NO_LANE, _FAR, slow)
         square = jnp.minimum(square, slow * slow + brake * jnp.maximum(end, 0))

@@ -16,7 +16,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, turn_speed
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, bend_speed, curvature
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.numerics import computed_once, mapped_like
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
@@ -36,7 +36,7 @@ from limsim_jax.traffic.ego import (
     track,
     with_free,
 )
-from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, start
+from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, side_to_look, start
 from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes
 from limsim_jax.traffic.neighbors import (
     Ahead,
@@ -51,7 +51,7 @@ from limsim_jax.traffic.right_of_way import give_way, rows_ahead
 from limsim_jax.traffic.signals import switch
 from limsim_jax.types import Config, Schedule, State, Status
 
-PATIENCE = 10.0
+PATIENCE = 20.0
 """s of waiting at the end of a wrong lane before a driver gives up the route."""
 
 AT_END = 40.0
@@ -108,7 +108,8 @@ def decide(
     ahead = look_ahead(config, lane_map, state)
     v0, v_ahead, distance = _speeds(lane_map, state, ahead)
     # changes to the left and to the right may start in turns, so nobody enters a gap from both sides
-    side = jnp.where((state.step // config.decision_every) % 2 == 0, 1, -1)
+    turn = jnp.where((state.step // config.decision_every) % 2 == 0, 1, -1)
+    side = side_to_look(lane_map, state, turn)
     beside, beside_s, allowed = place_beside(lane_map, state, side)
     other, other_s = other_lane(lane_map, state)
     n = state.lane.shape[0]
@@ -124,7 +125,9 @@ def decide(
     found = computed_once(found)
     own, second, new = (jax.tree.map(lambda x: x[:, k], found) for k in range(3))  # noqa: B023
     if traffic.lane_changes:
-        choice = choose_lane(traffic.model, lane_map, state, v0, own, new, beside, beside_s, allowed, side)
+        choice = choose_lane(
+            traffic.model, lane_map, state, v0, own, new, beside, beside_s, allowed, side, turn
+        )
         choice = choice._replace(side=jnp.where(is_free(state), 0, choice.side))
     else:
         choice = _stay(state)
@@ -138,7 +141,7 @@ def decide(
         state = start(lane_map, state, choice)
     rows = rows_ahead(config, lane_map, state, ahead)
     lights = switch(config, lane_map, state, rows.lane, rows.line)
-    yielding = give_way(lane_map, state, rows, own, jnp.asarray(lane_states(lane_map.signals, lights.phase)))
+    yielding = give_way(lane_map, state, rows, own, lights)
     state = replace(state, lights=lights, held=yielding.held, stopped=yielding.stopped)
     wall = jnp.minimum(_lane_end(lane_map, state, ahead), yielding.stop + state.driver.s0)
     obstacles = Obstacles(
@@ -190,7 +193,8 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
     stopping = (state.v * state.v / (2 * state.driver.b))[:, None]
     end = ahead.start + lane_map.length[ahead.lane] - _WALL
     wide = ahead.start + lane_map.end_s[ahead.lane] - _WALL
-    room = wide - (_WALL_ROOM - _WALL)
+    # and where the lane is too short for that, nobody waits before it, on a lane that it would block
+    room = jnp.maximum(wide - (_WALL_ROOM - _WALL), ahead.start + lane_map.length[ahead.lane] / 2)
     end = jnp.where((state.side == 0)[:, None], jnp.where(room > stopping, room, wide), end)
     return jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
 
@@ -205,7 +209,7 @@ def _speeds(
     # lanes to come: limit and tightest bend
     lane = ahead.lane[:, 1:]
     limit = driver.speed_factor[:, None] * lane_map.speed_limit[lane]
-    speed = jnp.minimum(limit, turn_speed(lane_map, lane, driver.a_lat[:, None]))
+    speed = jnp.minimum(limit, bend_speed(lane_map, lane, driver.a_lat[:, None]))
     speed = jnp.where(lane == NO_LANE, NO_GAP, speed)
     # the own lane: its bend at a few places within braking distance
     reach = state.v * state.v / driver.b + 10.0

@@ -38,6 +38,9 @@ REST = 4.0
 SLOWEST = 4.0
 """m/s, speed assumed of a vehicle in a jam when it asks whether it could still change back."""
 
+HARDEST = 0.5
+"""Of `b_max`: no lane change may ask more braking of anybody, however urgent it is."""
+
 ROOM = 0.5
 """m, least gap to the new leader and follower."""
 
@@ -81,8 +84,32 @@ def incentive(
     return own_then - own_now + politeness * (new_then - new_now + old_then - old_now)
 
 
+def closing(v: Float[Array, " N"], v_lead: Float[Array, " N"], gap: Float[Array, " N"]) -> Float[Array, " N"]:
+    """Braking, m/s^2, that brings `v` down to the leader's speed within the gap."""
+    faster = jnp.maximum(v - v_lead, 0)
+    return faster * faster / (2 * jnp.maximum(gap, ROOM))
+
+
+def side_to_look(lane_map: LaneMap, state: State, turn: Int[Array, ""]) -> Int[Array, " N"]:
+    """Where every vehicle looks for a place at this decision: +1 left, -1 right.
+
+    Sides take turns, but who must change lanes soon keeps looking where it has to go, so that whoever lets
+    it in goes on to do so.
+    """
+    press = _pressing(lane_map, state)
+    to_go = lane_map.routes.lanes_to_go[state.lane, state.goal]
+    return jnp.where(press > COURTEOUS, jnp.sign(to_go), turn)
+
+
+def _pressing(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
+    to_go = lane_map.routes.lanes_to_go[state.lane, state.goal]
+    taper = (lane_map.length - lane_map.end_s)[state.lane]
+    room = lane_map.routes.change_distance[state.lane, state.goal] - taper - state.s
+    return urgency(to_go, room, state.v, state.driver.lane_change_time)
+
+
 def place_beside(
-    lane_map: LaneMap, state: State, side: Int[Array, ""]
+    lane_map: LaneMap, state: State, side: Int[Array, " N"]
 ) -> tuple[Int[Array, " N"], Float[Array, " N"], Bool[Array, " N"]]:
     """Lane and s (m) on the side (+1 left, -1 right) of every vehicle, and whether it may change there.
 
@@ -115,9 +142,10 @@ def choose_lane(
     lane: Int[Array, " N"],
     s: Float[Array, " N"],
     allowed: Bool[Array, " N"],
-    side: Int[Array, ""],
+    side: Int[Array, " N"],
+    turn: Int[Array, ""],
 ) -> LaneChoice:
-    """The lane change to `side` that each vehicle wants and may start now.
+    """The lane change to `side` that each vehicle wants and may start now, if it is the turn of that side.
 
     `own` and `pair` are the neighbours on the own lane and on `lane` beside it, level with `s` m. All
     vehicles choose from the same state. Two that enter the same gap come from the same lane and keep
@@ -127,9 +155,7 @@ def choose_lane(
     me = jnp.arange(state.lane.shape[0], dtype=jnp.int32)
     routes = lane_map.routes
     to_go = routes.lanes_to_go[state.lane, state.goal]
-    taper = (lane_map.length - lane_map.end_s)[state.lane]
-    room = routes.change_distance[state.lane, state.goal] - taper - state.s
-    press = computed_once(urgency(to_go, room, state.v, driver.lane_change_time))
+    press = computed_once(_pressing(lane_map, state))
     wanted = jnp.sign(to_go)
     reachable = routes.reachable[lane, state.goal]
     # a lane on the wanted side may still lead nowhere: the change may be possible only further on
@@ -176,15 +202,18 @@ def choose_lane(
 
     # safety (eq. 2): nobody has to brake harder than b_safe, and there is room
     b_safe = driver.b_safe + SAFE_URGENT * press
-    safe = (~follower | ((new_then > -b_safe) & (pair.lag_gap > ROOM))) & (
-        (pair.lead < 0) | ((own_then > -b_safe) & (pair.lead_gap > ROOM))
+    # the models are mild where a cut-in leaves a short gap; what the speeds ask for must not be hard either
+    b_lag, b_own = (HARDEST * jnp.where(i[k] < 0, 0, driver.b_max[i[k]]) for k in (3, 1))
+    need_lag, need_own = (closing(v[k], v_lead[k], gap[k]) for k in (3, 1))
+    safe = (~follower | ((new_then > -b_safe) & (need_lag < b_lag) & (pair.lag_gap > ROOM))) & (
+        (pair.lead < 0) | ((own_then > -b_safe) & (need_own < b_own) & (pair.lead_gap > ROOM))
     )
     # a change away from the route must leave time to come back, and none is begun that the lane cannot hold
     away = (wanted * side < 0) | ((wanted == side) & farther) | ((wanted == 0) & (back_to_go != 0))
     count = jnp.abs(back_to_go).astype(back.dtype)
     late = away & (back < 3 * jnp.maximum(state.v, SLOWEST) * driver.lane_change_time * (count + 1))
     rested = (state.rest <= 0) | (press > 0)
-    starts = allowed & reachable & safe & ~late & rested & (advantage > driver.threshold)
+    starts = allowed & reachable & safe & ~late & rested & (advantage > driver.threshold) & (side == turn)
 
     asks = towards & (press > COURTEOUS) & allowed & follower & ~starts
     starts, asks = computed_once((starts, asks))

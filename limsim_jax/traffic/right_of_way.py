@@ -27,11 +27,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, turn_speed
-from limsim_jax.maps.signals import SignalState
+from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.neighbors import Ahead, Pair, Shelf
-from limsim_jax.types import Config, Driver, State
+from limsim_jax.types import Config, Driver, Lights, State
 
 GAP_LEAD = 1.5
 """s between the own exit of a stretch and the entry of a vehicle with priority, for a `gap_factor` of 1."""
@@ -58,6 +58,8 @@ _PAIRS = 2  # conflicts that are looked at, per slot; more at once make vehicles
 _EASY = 2.0  # m/s^2, braking from which conflicts ahead matter
 _MARGIN = 0.5  # m between the front bumper and what it waits at
 _YELLOW = 2.5  # s of yellow that are counted on
+_OVER_LINE = 2.0  # m beyond the line at which a vehicle that rolls may still stop
+_SLOWS = 1.0  # m/s^2, braking of who may stop inside a junction
 _STANDS = 1.0  # m/s, below which the vehicle ahead counts as standing
 
 
@@ -139,12 +141,13 @@ class _Sight(NamedTuple):
     line: Array  # m to the stop line
     stuck: Array  # 1 if kept by a light, a full exit or a queue
     held: Array  # 1 if kept by the right of way at the last decision
+    slows: Array  # 1 if it brakes: it may stop on its way
     major: Array  # 1 if the light gives priority, -1 if it takes it
     slot: Array
 
 
 @jax.named_scope("right_of_way")
-def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, shows: Int[Array, " L"]) -> Yielding:
+def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, lights: Lights) -> Yielding:
     """Where every vehicle has to wait, and whom it follows through merges and splits.
 
     Args:
@@ -152,14 +155,16 @@ def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, shows: Int[
       state: the world.
       rows: the connectors to come.
       own: leader and follower on the own way.
-      shows: what the light at the entry of every lane shows, `SignalState`.
+      lights: of the decision.
     """
     table, driver = lane_map.conflicts, state.driver
+    shows = jnp.asarray(lane_states(lane_map.signals, lights.phase))  # at the entry of every lane
     n = state.lane.shape[0]
     brake = state.v * state.v / (2 * BRAKE)
 
     speed = turn_speed(lane_map, rows.lane, driver.a_lat[:, None])
-    at_light, major = _lights(state, rows, speed, shows)
+    since = lights.elapsed[lane_map.signals.lane_program[rows.lane]]
+    at_light, major = _lights(state, rows, speed, shows, since)
     full = _exit_full(lane_map, state, rows, own)
     standing = (own.lead >= 0) & (state.v[own.lead] < _STANDS) & (state.v < _STANDS)
     queued = standing & (own.lead_gap < 2 * driver.s0 + 1)
@@ -182,6 +187,7 @@ def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, shows: Int[
         line=rows.line,
         stuck=everywhere((at_light < NO_GAP) | full | queued[:, None]),
         held=everywhere(state.held),
+        slows=everywhere(state.a < -_SLOWS),
         major=major.astype(jnp.float32),
         slot=everywhere(jnp.arange(n)),
     )
@@ -281,7 +287,8 @@ def _meet(
     way = f_out + other.length - other.y
     out = travel_time(way, jnp.minimum(other.v, other.slow), other.slow, 0.7 * other.a)
     soon = travel_time(distance_in, me.v, me.fast, me.a)
-    waits &= ~((out + GAP_FOLLOW < soon) & (other.stuck == 0) & ~merges)
+    halts = (other.stuck > 0) | ((other.slows > 0) & (other.line < -_MARGIN))  # perhaps within the stretch
+    waits &= ~((out + GAP_FOLLOW < soon) & ~halts & ~merges)
     # merging: behind the other where there is room behind it, and where that asks for less than to stop
     behind = (s_out - me.y) - (f_out - other.y + other.length)
     s0, T, b = (x[vehicle][None] for x in (driver.s0, driver.T, driver.b))
@@ -386,20 +393,31 @@ def _passes(minor: _Sight, way: _Way, gap: Array, major: _Sight, soon: Array, me
 
 
 def _lights(
-    state: State, rows: Rows, speed: Float[Array, "N R"], shows: Int[Array, " L"]
+    state: State,
+    rows: Rows,
+    speed: Float[Array, "N R"],
+    shows: Int[Array, " L"],
+    since: Float[Array, "N R"],
 ) -> tuple[Array, Array]:
-    """m to the line where a light says stop, else NO_GAP; and what the light says of priority, [N, R]."""
+    """m to the line where a light says stop, else NO_GAP; and what the light says of priority, [N, R].
+
+    `since`: s that the light has shown this.
+    """
     light = shows[rows.lane]
     brake = state.v * state.v
     line = jnp.maximum(rows.line, 0)
+    # at yellow a driver decides once: what counts is how far the line was when it began
+    then = line + state.v[:, None] * since
     # who slows down for a turn comes too late even if it is near
-    late = 2 * line > _YELLOW * (state.v[:, None] + speed)
+    late = 2 * then > _YELLOW * (state.v[:, None] + speed)
     yellow = (light == SignalState.YELLOW) & (
-        brake[:, None] <= 2 * jnp.where(late, 1.5 * YELLOW_BRAKE, YELLOW_BRAKE) * line
+        brake[:, None] <= 2 * jnp.where(late, 1.5 * YELLOW_BRAKE, YELLOW_BRAKE) * then
     )
     at_red = (light == SignalState.RED) | (light == SignalState.RED_YELLOW)
-    # who cannot stop any more drives on
+    # who cannot stop any more drives on, but who only rolls stands, even with its bumper over the line
     red = at_red & (brake[:, None] <= 2 * 0.9 * state.driver.b_max[:, None] * line)
+    rolls = (state.v < _STANDS)[:, None] & (rows.line > -_OVER_LINE)
+    red |= (at_red | (light == SignalState.YELLOW)) & rolls
     stops = (yellow | red) & (rows.x < 0) & (rows.line > -NO_GAP / 2) & (rows.connector >= 0)
     minor = (light == SignalState.GREEN_MINOR) | (light == SignalState.STOP)
     major = jnp.where(light == SignalState.GREEN_MAJOR, 1, jnp.where(minor, -1, 0))
