@@ -110,11 +110,57 @@ def traffic_speed(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def traffic_sumo(result: dict[str, Any]) -> str:
+    """One lane in a sentence, networks side by side."""
+    one = result["one_lane"]["ballistic, as ours"]
+
+    def mean(runs: list[dict[str, Any]], name: str) -> float:
+        return sum(run[name] for run in runs) / len(runs)
+
+    rows = [
+        "| network, SUMO (IDM) / ours (ACC-IDM) | arrived, veh/h | mean speed, m/s | travel time, s "
+        "| jammed or teleported | in collisions |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    for name, network in result["networks"].items():
+        theirs, ours = (network["runs"][x] for x in ("SUMO, IDM", "ours, ACC-IDM"))
+        pairs = [
+            f"{mean(theirs, key):,.{digits}f} / {mean(ours, key):,.{digits}f}"
+            for key, digits in (("arrived_per_hour", 0), ("mean_speed", 1), ("travel_time", 0))
+        ]
+        teleports = sum(run["missed"] for run in theirs)
+        jams = f"{teleports} vehicles / {sum(run['gridlock'] for run in ours)} of {len(ours)} runs"
+        collisions = " / ".join(str(sum(run["collided"] for run in runs)) for runs in (theirs, ours))
+        rows.append(f"| `{name}` | {' | '.join(pairs)} | {jams} | {collisions} |")
+    head = (
+        f"One lane: 20 unequal vehicles in stop-and-go for 300 s, IDM, ballistic steps: positions agree to "
+        f"{1000 * one['position_rms']:.0f} mm RMS and {1000 * one['position_max']:.0f} mm at most after "
+        f"{one['driven'] / 1000:.1f} km."
+    )
+    return "\n".join([head, "", *rows])
+
+
+def sweep_speed(result: dict[str, Any]) -> str:
+    """How long sweeps take."""
+    rows = [
+        "| sweep | seeds | from command to table, s | of that running worlds, s | peak memory, MB |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for r in result["sweeps"]:
+        rows.append(
+            f"| {r['experiment']} | {r['seeds']:,} | {r['wall_s']:.0f} | {r['run_s']:.0f} "
+            f"| {r['peak_memory_mb']:,} |"
+        )
+    return "\n".join(rows)
+
+
 TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "maps_against_carla": carla,
     "maps_against_sumo": sumo,
     "maps_speed": speed,
     "soundness": soundness,
+    "sweep_speed": sweep_speed,
+    "traffic_against_sumo": traffic_sumo,
     "traffic_speed": traffic_speed,
 }
 

@@ -90,7 +90,7 @@ def platoon(vehicles: int, seed: int = 0) -> Platoon:
     behind = np.concatenate([[0.0], np.cumsum(length[:-1] + gaps[1:])])
     return Platoon(
         length=length, T=draw(0.8, 2.0), s0=s0, a=draw(0.8, 2.6), b=draw(1.2, 4.0), delta=draw(3.0, 5.0),
-        b_max=draw(7.0, 9.0), speed_factor=draw(0.7, 1.0), s=np.round(behind[-1] - behind + 40.0, 2),
+        b_max=draw(7.0, 9.0), speed_factor=draw(0.7, 1.2), s=np.round(behind[-1] - behind + 40.0, 2),
     )  # fmt: skip
 
 
@@ -715,27 +715,21 @@ carFollowModel IDM, 0.1 s steps, ballistic. Stops of buses are made in none. Bol
 pasubio_tls.add.xml and every fourth vehicle.
 
 - One lane: SUMO's IDM is ours. The centimetre that is left is the leader's: a free ego adds up its x in
-  float32, 2 km from the origin of the map, and its followers keep their distance to it. Drivers who want
-  more than the limit are not in the platoon: ours keep to the plain limit before the end of every edge.
+  float32, 2 km from the origin of the map, and its followers keep their distance to it.
 - First vehicle after green: with steps of 1 s a driver starts a step later, and Krauss dawdles; IDM drivers
   of both simulators start at once.
 - Turns: SUMO drives through junctions with the speed that the network gives (5.5 m/s^2 across), ours with
   what the driver accepts (2.5 m/s^2, on average). Turning queues discharge slower, and so do lanes that
   are led sideways within a few metres of a junction (104012170 of ingolstadt1).
-- Lane changes take no time and no way in SUMO. Ours take 3 to 7 s and 22 m at least, and who has to change
-  waits 25 m before the end of the lane. Edges shorter than that do not serve: who enters one on the wrong
-  lane waits before it, maybe within the junction, for good. That is what jams ingolstadt1 (edge 164051413,
-  8.9 m) and limsim_town05 (edge -28, 27 m).
+- Lane changes take no time and no way in SUMO. Ours take 3 to 7 s and 22 m at least, so that edges shorter
+  than that hardly serve; who ends up there on the wrong lane takes another way (edge 164051413 of
+  ingolstadt1, 8.9 m; edge -28 of limsim_town05, 27 m). Turns are then missed that SUMO's drivers make.
 - SUMO's drivers choose the lane that leads on farthest, and so use all lanes of the roundabout. Ours stay on
   the lane of their exit, four fifths of them on the outermost, and wait for one another.
 - limsim_bigInter jams in ours when vehicles that have entered on a gap meet others inside: priority is not
   transitive there (E0 yields to -E1, which yields to E2, whose path E0 blocks).
-- Red lights are crossed in two ways. Who comes to rest less than s0 before its stop may roll over the line at
-  walking pace, and then drives on (trucks, with a = 1.3 and b = 4). And who begins to stop at yellow asks
-  again at every decision: the ACC-IDM brakes late, and where more than 3 m/s^2 is needed it drives on
-  (bologna_pasubio).
 - SUMO looks for collisions along lanes. Ours compares bodies, so it also finds those who touch beside
-  one another where lanes come close, and on bridges those below (limsim_town05), for it has no heights.
+  one another where lanes come close.
 - Vehicles that stand for 300 s are teleported by SUMO. Ours stay, and hold up all behind them.
 """
 

@@ -142,6 +142,8 @@ def build_traffic(
 ) -> tuple[Demand, int]:
     """Plain traffic: the default population that fits the map, from all origins to all goals.
 
+    A map without entries has traffic come in at the beginnings of a dozen of its roads.
+
     Args:
         network: the map.
         lane_map: of that map, with the default goals.
@@ -156,12 +158,12 @@ def build_traffic(
         ValueError: numbers that make no sense, or more vehicles than the roads hold.
     """
     from limsim_jax.maps.routing import default_goals
-    from limsim_jax.traffic.demand import Flow, build_demand, entries
+    from limsim_jax.traffic.demand import Flow, beginnings, build_demand, entries
     from limsim_jax.traffic.vehicles import default_population, fitting
 
     if vehicles < 0:
         raise ValueError(f"{vehicles} vehicles at the start? 0 or more")
-    origins = list(entries(network))
+    origins = list(entries(network)) or beginnings(network, 12)
     flows = [Flow(origin=name, rate=rate) for name in origins]
     goals, population = default_goals(network), fitting(default_population(), lane_map)
     km = sum(lane.length for lane in network.drivable_lanes() if lane.junction is None) / 1e3

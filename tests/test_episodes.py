@@ -2,6 +2,7 @@
 
 import functools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -50,10 +51,12 @@ def test_the_ego_as_its_trace_has_it(policy, seed):
     limit = np.asarray(lane_map.speed_limit)[lane]
     assert metrics["max_overspeed"] == pytest.approx(np.maximum(v - limit, 0).max(), abs=1e-4)
     assert metrics["speeding"] == pytest.approx((v > limit + 0.01).mean(), abs=0.005)
-    goal = episodes(policy)._egos.goal[0]
+    egos = episodes(policy)._egos
+    assert egos.goal is not None and egos.lane is not None
+    goal = egos.goal[0]
     to_go = np.asarray(lane_map.routes.distance)[lane, goal] - s
     reached = to_go < 1e8
-    start = np.asarray(lane_map.routes.distance)[episodes(policy)._egos.lane[0], goal] - 60.0
+    start = np.asarray(lane_map.routes.distance)[egos.lane[0], goal] - 60.0
     share = 1 - to_go[reached][-1] / start
     expected = 1.0 if metrics["arrived"] else share
     assert metrics["completion"] == pytest.approx(expected, abs=0.01)
@@ -62,7 +65,7 @@ def test_the_ego_as_its_trace_has_it(policy, seed):
 @pytest.mark.parametrize("policy, seed", cases())
 def test_contacts_are_where_bodies_overlap(policy, seed):
     _, _, trace, ego, _, metrics = replayed(policy, seed)
-    still = np.zeros(2, np.float32)
+    still = jnp.zeros(2)
     first, who = None, None
     for t in range(len(trace.time)):
         others = [j for j in range(SLOTS) if j != ego and trace.active[t, j] and trace.active[t, ego]]

@@ -63,7 +63,7 @@ def test_the_ego_starts_where_the_file_says_and_nobody_is_on_top_of_it(name):
     assert apart[same].all(), "others keep off"
     assert same.any() or name != "highway", "though they are on the same lane"
     assert len({float(x) for x in start.v.sum(-1)}) == 8, "worlds differ"
-    assert (start.active.sum(-1) == experiment.traffic.vehicles + 1).all()
+    assert (start.active.sum(-1) == (experiment.traffic.vehicles or 0) + 1).all()
 
 
 def test_an_ego_with_a_random_start_is_elsewhere_in_every_world(write):

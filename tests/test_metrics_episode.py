@@ -144,7 +144,7 @@ def test_a_free_drive():
         "min_ttc", "min_ttc_time", "min_ttc_1d", "min_ttc_2d", "min_thw", "max_drac", "max_drac_time",
         "min_pet", "min_pet_time", "min_distance", "rss_first_time", "contact_time", "contact_other",
         "contact_type", "contact_at_fault", "contact_responsibility", "contact_delta_v", "max_delta_v",
-        "off_road_time",
+        "off_road_time", "red_light_time",
     }  # fmt: skip
     # without traffic the limit is the reference: 10 of 15 m/s
     assert found["limsim_faithful_efficiency"] == pytest.approx(10 / 15, rel=1e-4)

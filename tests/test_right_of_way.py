@@ -50,6 +50,7 @@ def random_sights(n, seed):
         "fast": np.maximum(v, slow), "a": rng.uniform(0.8, 2.5, n), "brake": v * v / 8,
         "wait": rng.choice([0.0, 2.0, 10.0, 40.0], n), "line": rng.uniform(-20, 40, n),
         "stuck": rng.integers(0, 2, n) * 1.0, "held": rng.integers(0, 2, n) * 1.0,
+        "slows": rng.integers(0, 2, n) * 1.0,
         "major": rng.choice([-1.0, 0.0, 1.0, 2.0], n), "slot": np.arange(n) * 1.0 + 1000 * seed,
     }  # fmt: skip
     return right_of_way._Sight(**{name: jnp.asarray(x, jnp.float32) for name, x in values.items()})
@@ -86,21 +87,24 @@ def rows_of(line, n):
 
 
 def test_yellow_is_a_dilemma_that_the_braking_decides():
-    """Stop at yellow if 3 m/s^2 are enough; who would have to brake harder drives on."""
+    """Stop at yellow if 3 m/s^2 were enough when it began; who would have had to brake harder drives on."""
     n = 300
     rng = np.random.default_rng(0)
-    v, line = rng.uniform(3, 16, n), rng.uniform(1, 60, n)
+    v, line, since = rng.uniform(3, 16, n), rng.uniform(1, 60, n), rng.uniform(0, 3, n)
     state = state_of("highway", [0] * n, [0.0] * n, v, [0] * n)
     rows = rows_of(line, n)
     speed = jnp.full((n, 2), 20.0)  # straight on
 
+    shown = jnp.asarray(np.stack([since, since], -1), jnp.float32)
+
     def stops(light):
-        where, _ = right_of_way._lights(state, rows, speed, jnp.full(4, int(light)))
+        where, _ = right_of_way._lights(state, rows, speed, jnp.full(4, int(light)), shown)
         return np.asarray(where)[:, 0] < 1e5
 
-    late = 2 * line > 2.5 * (v + 20)
+    then = line + v * since
+    late = 2 * then > 2.5 * (v + 20)
+    np.testing.assert_array_equal(stops(SignalState.YELLOW), v * v / (2 * then) <= np.where(late, 4.5, 3.0))
     needed = v * v / (2 * line)
-    np.testing.assert_array_equal(stops(SignalState.YELLOW), needed <= np.where(late, 4.5, 3.0))
     np.testing.assert_array_equal(stops(SignalState.RED), needed <= 0.9 * 8)
     assert not stops(SignalState.GREEN_MAJOR).any() and not stops(SignalState.OFF).any()
     assert stops(SignalState.RED_YELLOW)[v < 4].any()

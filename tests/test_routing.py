@@ -14,6 +14,8 @@ from limsim_jax.maps import load_map
 from limsim_jax.maps.network import MapError
 from limsim_jax.maps.routing import (
     FAR,
+    ROOM_TO_CHANGE,
+    SHORT_PENALTY,
     build_fixed_routes,
     build_routes,
     default_goals,
@@ -202,7 +204,12 @@ def random_network(seed):
     return network(lanes), goals
 
 
-def brute_force(net, goal, penalty):
+def penalty(lane):
+    """Of a lane change: more where the lane is short."""
+    return 17.0 + SHORT_PENALTY * max(0.0, 1 - lane.length / ROOM_TO_CHANGE)
+
+
+def brute_force(net, goal):
     """Cost to go of every lane: Dijkstra's algorithm forwards from each, on plain dictionaries."""
     found = {}
     for start in net.lanes:
@@ -219,7 +226,7 @@ def brute_force(net, goal, penalty):
                 heapq.heappush(queue, (cost + lane.length, after))
             for side, allowed in ((lane.left, lane.may_change_left), (lane.right, lane.may_change_right)):
                 if allowed:
-                    heapq.heappush(queue, (cost + penalty, side))
+                    heapq.heappush(queue, (cost + penalty(lane), side))
         found[start] = best
     return found
 
@@ -230,7 +237,7 @@ def test_costs_agree_with_brute_force(seed):
     row = rows(net)
     table = build_routes(net, row, goals, change_penalty=17.0)
     for g, goal in enumerate(goals):
-        for name, expected in brute_force(net, goal, 17.0).items():
+        for name, expected in brute_force(net, goal).items():
             assert table.reachable[row[name], g] == math.isfinite(expected)
             assert table.distance[row[name], g] == pytest.approx(min(expected, FAR), rel=1e-6)
 
@@ -257,7 +264,7 @@ def test_driving_by_the_table_costs_what_it_says(seed):
                 for _ in range(abs(to_go)):
                     beside = lane.left if to_go > 0 else lane.right
                     assert beside and (lane.may_change_left if to_go > 0 else lane.may_change_right)
-                    lane, cost, changed = net.lanes[beside], cost + 17.0, changed + 1
+                    lane, cost, changed = net.lanes[beside], cost + penalty(lane), changed + 1
                 due = None
                 name = lane.id
                 if table.lanes_to_go[row[name], g]:  # the next change, perhaps on this same lane
@@ -390,7 +397,7 @@ def test_distances_are_those_of_sumos_router(name):
     row = rows(net)
     edges = [e for e in theirs.getEdges(withInternal=False) if e.allows("passenger")]
     goals = [[lane.id for lane in net.road_lanes(e.getID()) if lane.id in row] for e in edges]
-    table = build_routes(net, row, goals, change_penalty=1e-3)
+    table = build_routes(net, row, goals, change_penalty=1e-3, short_penalty=0.0)
     compared = 0
     for g, end in enumerate(edges):
         for start in edges[:: max(1, len(edges) // 12)]:

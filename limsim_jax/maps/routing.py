@@ -133,6 +133,7 @@ def build_routes(
     *,
     vehicle_class: str | None = None,
     change_penalty: float = CHANGE_PENALTY,
+    short_penalty: float = SHORT_PENALTY,
     tolerance: float = TOLERANCE,
 ) -> RouteTable:
     """Tables of the way from every lane to every goal.
@@ -144,6 +145,7 @@ def build_routes(
             `default_goals`.
         vehicle_class: Use only lanes that this class may use. Default: all drivable lanes.
         change_penalty: Cost of one lane change, m.
+        short_penalty: What is added on a lane of no length; on one of `ROOM_TO_CHANGE` nothing.
         tolerance: Prefer staying in the lane if it is at most this much longer, m.
 
     Raises:
@@ -159,7 +161,8 @@ def build_routes(
             if name not in rows:
                 raise MapError(_no_such_lane(network, name), file=network.source, element=f"goal {name!r}")
     graph = _LaneGraph(network, rows, vehicle_class)
-    return graph.solve([[rows[name] for name in group] for group in groups], change_penalty, tolerance)
+    columns = [[rows[name] for name in group] for group in groups]
+    return graph.solve(columns, change_penalty, tolerance, short_penalty=short_penalty)
 
 
 def build_fixed_routes(
@@ -348,6 +351,7 @@ class _LaneGraph:
         change_penalty: float,
         tolerance: float,
         mask: NDArray[np.bool_] | None = None,
+        short_penalty: float = SHORT_PENALTY,
     ) -> RouteTable:
         """The tables, with one row more for the null lane. `mask` keeps some of the links ahead."""
         size, count = len(self.lanes), len(goals)
@@ -361,7 +365,7 @@ class _LaneGraph:
         links = np.concatenate([ahead, self.left, self.right, np.column_stack([row, size + goal])])
         # where a lane is too short to change on, earlier is better
         room = self.length[np.concatenate([self.left, self.right])[:, 0]]
-        changes = max(change_penalty, 1e-6) + SHORT_PENALTY * np.clip(1 - room / ROOM_TO_CHANGE, 0, 1)
+        changes = max(change_penalty, 1e-6) + short_penalty * np.clip(1 - room / ROOM_TO_CHANGE, 0, 1)
         costs = np.concatenate([self.cost[ahead[:, 0]], changes, self.cost[row]])
         graph = _matrix(links[:, ::-1], np.maximum(costs, 1e-6), size + count)
         cost = np.full((size, count), np.inf)

@@ -130,6 +130,19 @@ def entries(network: Network) -> dict[str, tuple[str, ...]]:
     }
 
 
+def beginnings(network: Network, count: int) -> list[str]:
+    """Names of at most `count` roads on which traffic can come in where there are no `entries`.
+
+    Spread evenly over the map's list of roads; none is shorter than `CHANGE_ROOM`.
+    """
+    names = [
+        name
+        for name, lanes in _beginnings(network).items()
+        if all(lane.junction is None and lane.length > CHANGE_ROOM for lane in lanes)
+    ]
+    return names[:: -(-len(names) // count)] if names else []
+
+
 def _drivable(network: Network, name: str) -> bool:
     return name in network.lanes and network.lanes[name].drivable
 

@@ -41,6 +41,7 @@ from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes
 from limsim_jax.traffic.neighbors import (
     Ahead,
     Obstacles,
+    Pair,
     look_ahead,
     neighbors,
     other_lane,
@@ -124,6 +125,7 @@ def decide(
     )
     found = computed_once(found)
     own, second, new = (jax.tree.map(lambda x: x[:, k], found) for k in range(3))  # noqa: B023
+    own = _behind_tails(lane_map, state, own)
     if traffic.lane_changes:
         choice = choose_lane(
             traffic.model, lane_map, state, v0, own, new, beside, beside_s, allowed, side, turn
@@ -176,6 +178,26 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
         state,
         goal=jnp.where(changes, goal, state.goal),
         status=state.status | jnp.where(changes, int(Status.MISSED_ROUTE), 0),
+    )
+
+
+def _behind_tails(lane_map: LaneMap, state: State, own: Pair) -> Pair:
+    """Leaders of those who leave the map at the end of their lane: also who has left it but for its tail.
+
+    All others see those on their way, or in a split of the ways.
+    """
+    ends = lane_map.routes.is_goal[state.lane, state.goal]
+    rear = lane_map.length[state.previous] + state.s - state.shape.length
+    out = lane_map.length.shape[0]
+    lane = jnp.where(state.active & (state.s < state.shape.length), state.previous, NO_LANE)
+    lane = jnp.where(lane == NO_LANE, out, lane)
+    least = jnp.full(out, NO_GAP, rear.dtype).at[lane].min(rear, mode="drop")
+    slot = jnp.where(rear == least[state.previous], jnp.arange(lane.shape[0], dtype=own.lead.dtype), -1)
+    last = jnp.full(out, -1, own.lead.dtype).at[lane].max(slot, mode="drop")
+    gap = least[state.lane] - state.s
+    nearer = ends & (last[state.lane] >= 0) & (gap < own.lead_gap) & (gap > -state.shape.length)
+    return own._replace(
+        lead=jnp.where(nearer, last[state.lane], own.lead), lead_gap=jnp.where(nearer, gap, own.lead_gap)
     )
 
 

@@ -31,6 +31,7 @@ CREEP_SPEED = 5.0
 _STEEPEST = math.tan(0.2)  # way against the lane in a lane change: the ends of long bodies stay near theirs
 _GOAL = -2  # in place of the next lane, at the end of a goal
 _HAND_OVERS = 3  # lanes that a vehicle may leave behind in one step
+_BUMPER, _HALT = 0.4, 2.5  # m beyond the place to stop, still before the line; m/s^2 used there
 _APPROACH = 0.7  # of the comfortable deceleration: used to slow down for a bend ahead
 
 
@@ -73,6 +74,11 @@ def accelerations(
     v0 = jnp.minimum(decision.v0, reach)
     each, v, v_free = jax.tree.map(lambda value: value[None], (driver, state.v, v0))
     a = model(each, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free).min(0)
+    # the models roll on slowly within s0: who is about to stand at a line stops before it
+    line = jnp.where(index < 0, gap, NO_GAP).min(0) - driver.s0 + _BUMPER
+    need = state.v * state.v / (2 * jnp.maximum(line, 0.02))
+    rolls = (state.v < WALKING_SPEED) & (line < 1.0) & (need > 0.5)
+    a = jnp.where(rolls, jnp.minimum(a, -jnp.minimum(need, _HALT)), a)
     polite = (decision.courtesy >= 0) & state.active[decision.courtesy]
     gap = jnp.where(polite, decision.courtesy_gap + seen(decision.courtesy, x) - x, NO_GAP)
     v_lead = jnp.where(polite, seen(decision.courtesy, state.v), state.v)

@@ -51,7 +51,7 @@ WAITED = 3.0
 STUCK = 20.0
 """s of waiting of both, after which priority no longer holds: who waits longer goes."""
 
-_ROWS = 2  # connectors ahead that a vehicle looks at
+_ROWS = 3  # connectors ahead that a vehicle looks at
 _FOES = 3  # vehicles per conflict
 _BEHIND = 160.0  # m before a connector that still count as coming to it
 _PAIRS = 2  # conflicts that are looked at, per slot; more at once make vehicles wait
@@ -422,7 +422,8 @@ def _lights(
     minor = (light == SignalState.GREEN_MINOR) | (light == SignalState.STOP)
     major = jnp.where(light == SignalState.GREEN_MAJOR, 1, jnp.where(minor, -1, 0))
     left_over = (rows.line < -_MARGIN) & (at_red | (light == SignalState.YELLOW))  # clears the junction first
-    return jnp.where(stops, jnp.maximum(rows.line - _MARGIN, 0), NO_GAP), jnp.where(left_over, 2, major)
+    stop = jnp.where(stops, jnp.maximum(rows.line - _MARGIN, -_MARGIN), NO_GAP)
+    return stop, jnp.where(left_over, 2, major)
 
 
 def _exit_full(lane_map: LaneMap, state: State, rows: Rows, own: Pair) -> Bool[Array, "N R"]:
@@ -439,7 +440,7 @@ def _stop_sign(lane_map: LaneMap, state: State, rows: Rows) -> tuple[Bool[Array,
     sign = lane_map.conflicts.must_stop[rows.connector] & (rows.line > -_MARGIN)
     near = rows.line[:, 0] < 2.5
     stopped = sign[:, 0] & (state.stopped | ((state.v < 0.3) & near))
-    return sign & ~jnp.stack([stopped, jnp.zeros_like(stopped)], -1), stopped
+    return sign & ~(stopped[:, None] & (jnp.arange(_ROWS) == 0)[None]), stopped
 
 
 def _where_to_stop(
@@ -457,7 +458,7 @@ def _where_to_stop(
     until = jnp.where(beyond, jnp.maximum(wait_s - rows.x, 0), until)
     # before the line, unless the line is too near
     at_line = (rows.line > -_MARGIN) & (rows.line + _MARGIN > sight.brake)
-    line = jnp.maximum(rows.line - _MARGIN, 0)
+    line = jnp.maximum(rows.line - _MARGIN, -_MARGIN)
     stop = jnp.where(taken, jnp.where(at_line & ~beyond, jnp.minimum(line, until), until), NO_GAP)
     stop = jnp.where(barred & at_line, jnp.minimum(stop, line), stop)
     return stop, taken | barred

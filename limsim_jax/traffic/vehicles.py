@@ -363,18 +363,27 @@ SWEEP = 0.6
 """m, by how much a body may stand out of its path in the tightest bend of a map, see `fitting`."""
 
 
+RARE_BENDS = 50
+"""One lane in so many does not count in `fitting`."""
+
+CAR = 5.0
+"""m, length up to which a vehicle fits everywhere."""
+
+
 def fitting(population: Population, lane_map: LaneMap) -> Population:
     """The population without types that are too long for the bends of a map.
 
     In a bend of curvature kappa the ends of a body of length l stand out by kappa l^2 / 8. On most urban
     junctions that leaves trucks and buses no room beside traffic in the next lane; they are drawn no more.
+    A lane in `RARE_BENDS` may be as tight as it likes, and cars drive everywhere.
 
     Raises:
       ValueError: none fits.
     """
-    bend = float(np.max(np.asarray(lane_map.curvature_max)))
+    bends = np.asarray(lane_map.curvature_max)[np.asarray(lane_map.valid)]
+    bend = float(np.quantile(bends, 1 - 1 / RARE_BENDS, method="lower"))
     length = np.asarray(population.median)[:, PARAMETERS.index("length")]
-    fits = bend * length * length / 8 <= SWEEP
+    fits = (bend * length * length / 8 <= SWEEP) | (length <= CAR)
     share = np.where(fits, np.asarray(population.share), 0)
     if not share.any():
         raise ValueError(f"no vehicle of the population fits into bends of {1 / bend:.1f} m radius")

@@ -1,0 +1,106 @@
+"""How long sweeps take, and how much memory: the paper's five scenarios, and one scenario with many seeds.
+
+    python experiments/sweep_speed.py [--seeds 1000] [--more 4000]
+
+Every sweep is a process of its own with an empty compilation cache. Writes
+experiments/results/sweep_speed.json and .md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent / "results"
+
+MANY = """
+map = "highway"
+horizon = 60.0
+slots = 64
+[ego]
+start = "1-"
+lane = 1
+s = 60.0
+goal = "2-"
+[traffic]
+vehicles = 30
+[[traffic.flow]]
+origin = "1-"
+rate = 1500
+"""
+
+
+def sweep(experiment: str, seeds: int, folder: Path) -> dict[str, Any]:
+    """One sweep: seconds in all and in running, MB."""
+    out, cache = folder / f"{Path(experiment).stem}-{seeds}", folder / f"cache-{seeds}"
+    command = [
+        sys.executable,
+        "-m",
+        "limsim_jax.cli",
+        "sweep",
+        experiment,
+        f"--seeds={seeds}",
+        f"--out={out}",
+    ]
+    begin = time.perf_counter()
+    with subprocess.Popen(
+        [*command, "--no-report"], stdout=subprocess.PIPE, text=True,
+        env=os.environ | {"LIMSIM_JAX_CACHE": str(cache)},
+    ) as process:  # fmt: skip
+        text = process.communicate()[0]
+    if process.returncode:
+        raise SystemExit(text)
+    wall = time.perf_counter() - begin
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    ran = sum(float(line.rsplit(",", 1)[1].split()[0]) for line in text.splitlines() if " worlds, " in line)
+    print(text, flush=True)
+    return {
+        "experiment": Path(experiment).stem,
+        "seeds": seeds,
+        "wall_s": round(wall, 1),
+        "run_s": round(ran, 1),
+        "peak_memory_mb": round(peak),
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown."""
+    lines = [
+        "| sweep | seeds | from command to table, s | of that running worlds, s | peak memory, MB |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        name, seeds, wall, run, peak = row.values()
+        lines.append(f"| {name} | {seeds:,} | {wall:.0f} | {run:.0f} | {peak:,} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Parse the command line, run, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=1000)
+    parser.add_argument("--more", type=int, default=4000)
+    options = parser.parse_args()
+    rows = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        many = folder / "highway, 60 s.toml"
+        many.write_text(f'name = "highway_60"{MANY}')
+        # the peak is that of all children so far: the small one first
+        for experiment, seeds in ((many, options.seeds), (many, options.more), ("paper", 100)):
+            rows.append(sweep(str(experiment), seeds, folder))
+    head = "Regenerate: `python experiments/sweep_speed.py`\n\n"
+    (RESULTS / "sweep_speed.json").write_text(json.dumps({"sweeps": rows}, indent=1) + "\n")
+    (RESULTS / "sweep_speed.md").write_text(head + table(rows) + "\n")
+
+
+if __name__ == "__main__":
+    main()
