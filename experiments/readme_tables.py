@@ -128,9 +128,10 @@ def traffic_sumo(result: dict[str, Any]) -> str:
             f"{mean(theirs, key):,.{digits}f} / {mean(ours, key):,.{digits}f}"
             for key, digits in (("arrived_per_hour", 0), ("mean_speed", 1), ("travel_time", 0))
         ]
-        teleports = sum(run["missed"] for run in theirs)
+        teleports = sum(run["teleports"] for run in theirs)
         jams = f"{teleports} vehicles / {sum(run['gridlock'] for run in ours)} of {len(ours)} runs"
-        collisions = " / ".join(str(sum(run["collided"] for run in runs)) for runs in (theirs, ours))
+        hit = (sum(run[key] for run in runs) for key, runs in (("collisions", theirs), ("collided", ours)))
+        collisions = " / ".join(map(str, hit))
         rows.append(f"| `{name}` | {' | '.join(pairs)} | {jams} | {collisions} |")
     head = (
         f"One lane: 20 unequal vehicles in stop-and-go for 300 s, IDM, ballistic steps: positions agree to "
