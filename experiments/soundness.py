@@ -1,8 +1,9 @@
 """Many random episodes of background traffic on many maps, and what went wrong in them.
 
-    python experiments/soundness.py [--episodes 1000] [--map NAME_OR_FILE ...] [--out soundness]
+    python experiments/soundness.py [--episodes 1920] [--town-episodes 192] [--map NAME_OR_FILE ...]
 
-Every episode has other vehicles at the start, other arrivals, drivers and goals. Writes
+Every episode has other vehicles at the start, other arrivals, drivers and goals. By default on the bundled
+maps, and on CARLA's towns where the folder of real maps is there. Writes
 experiments/results/soundness.json and .md.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -30,7 +32,12 @@ RATES = {"highway": 2000.0, "ramp": 900.0, "intersection": 400.0, "roundabout": 
 """veh/h per origin; other maps: `OTHER_RATE`."""
 
 OTHER_RATE = 200.0
-INITIAL = 20  # vehicles at the start, about
+SLOTS = {"highway": 128, "ramp": 128, "long_route": 128}
+"""Vehicles at once; other bundled maps: 64, towns: 128."""
+
+SHARED = Path(os.environ.get("LIMSIM_SHARED_DATA", Path(__file__).parents[2] / "shared" / "data"))
+TOWNS = [f"carla_town0{n}" for n in (1, 3, 5)]
+INITIAL, IN_TOWN = 20, 50  # vehicles at the start, about
 HORIZON = 180.0  # s
 
 
@@ -101,11 +108,13 @@ def table(rows: list[dict[str, Any]]) -> str:
 def main() -> None:
     """Parse the command line, run, write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=1000)
-    parser.add_argument("--map", nargs="*", default=list(bundled_maps()))
-    parser.add_argument("--slots", type=int, default=64)
+    towns = [str(SHARED / "opendrive" / f"{name}.xodr") for name in TOWNS]
+    parser.add_argument("--episodes", type=int, default=1920)
+    parser.add_argument("--town-episodes", type=int, default=192)
+    parser.add_argument(
+        "--map", nargs="*", default=[*bundled_maps(), *(x for x in towns if Path(x).exists())]
+    )
     parser.add_argument("--chunk", type=int, default=64)
-    parser.add_argument("--initial", type=int, default=INITIAL)
     parser.add_argument("--rate", type=float)
     parser.add_argument("--out", default="soundness")
     options = parser.parse_args()
@@ -113,10 +122,10 @@ def main() -> None:
     rows = []
     for name in options.map:
         rate = options.rate or RATES.get(name, OTHER_RATE)
-        path = bundled_maps().get(name) or name
-        row = episodes(
-            path, rate, options.episodes, slots=options.slots, chunk=options.chunk, initial=options.initial
-        )
+        path, bundled = bundled_maps().get(name) or name, name in bundled_maps()
+        count = options.episodes if bundled else options.town_episodes
+        slots, initial = (SLOTS.get(name, 64), INITIAL) if bundled else (128, IN_TOWN)
+        row = episodes(path, rate, count, slots=slots, chunk=options.chunk, initial=initial)
         rows.append(row)
         print(json.dumps(row), flush=True)
         jax.clear_caches()

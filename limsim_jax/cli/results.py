@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -13,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from limsim_jax.report.tables import TextTable
     from limsim_jax.sweep.episode import Episodes
     from limsim_jax.sweep.experiment import Experiment
@@ -27,9 +30,14 @@ ResultsArgument = Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder
 ScenarioOption = Annotated[
     str | None, typer.Option(metavar="NAME", help="Scenario, where the results hold several.")
 ]
+JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the table as JSON.")]
 PolicyOption = Annotated[
     str | None, typer.Option(metavar="NAME", help="Policy, where the results hold several.")
 ]
+
+
+IN_SWEEP = 1
+"""Worst episodes with pictures in the report at the end of a sweep: each scenario costs a compilation."""
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -111,9 +119,9 @@ def sweep(
             print(f"{found.scenario}: {where} after {found.done} seeds, {state}")
     print(f"{ran} worlds run in {time.perf_counter() - begin:.0f} s, results in {folder}")
     if part is None:
-        _print_headline(folder)
+        opened, table = _print_headline(folder)
         if html:
-            _write_report(folder, folder / "report.html", worst=3)
+            _write_report(opened, table, folder / "report.html", worst=IN_SWEEP)
 
 
 def report(
@@ -123,16 +131,17 @@ def report(
     ] = None,
     worst: Annotated[int, typer.Option(min=0, help="Worst episodes to show with pictures and replays.")] = 6,
     csv: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the tables as CSV, too.")] = None,
+    json_file: JsonOption = None,
 ) -> None:
     """Print the main metrics with intervals, and write a page with plots and the worst episodes."""
-    _print_headline(results)
+    opened, table = _print_headline(results)
     if csv is not None:
         from limsim_jax.report.tables import write_csv
-        from limsim_jax.sweep.store import open_results
 
-        for path in write_csv(open_results(results), csv):
+        for path in write_csv(opened, csv, table=table):
             print(f"wrote {path}")
-    _write_report(results, results / "report.html" if out is None else out, worst)
+    _write_json(json_file, table)
+    _write_report(opened, table, results / "report.html" if out is None else out, worst)
 
 
 def compare(
@@ -145,6 +154,7 @@ def compare(
     ] = None,
     rows: Annotated[int, typer.Option(min=1, help="Print so many rows, those with most evidence.")] = 25,
     csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all rows as CSV.")] = None,
+    json_file: JsonOption = None,
 ) -> None:
     """Compare B with A seed by seed: equal seeds are equal traffic."""
     from limsim_jax.report.compare import compare as compare_results
@@ -164,6 +174,7 @@ def compare(
 
         writer.write_csv(found.table, csv)
         print(f"wrote {csv}")
+    _write_json(json_file, found.table)
 
 
 def verify(
@@ -351,11 +362,21 @@ def _bar() -> Iterator[Callable[[Progress], None]]:
         yield show
 
 
-def _print_headline(results: Path) -> None:
-    from limsim_jax.report.tables import headline
+def _print_headline(path: Path) -> tuple[Results, pa.Table]:
+    """Print it; the results and their summary."""
+    from limsim_jax.report.tables import headline, summary
     from limsim_jax.sweep.store import open_results
 
-    _print_table(headline(open_results(results)))
+    results = open_results(path)
+    table = summary(results)
+    _print_table(headline(results, table=table))
+    return results, table
+
+
+def _write_json(path: Path | None, table: pa.Table) -> None:
+    if path is not None:
+        path.write_text(json.dumps(table.to_pylist(), indent=1) + "\n")
+        print(f"wrote {path}")
 
 
 def _print_table(table: TextTable) -> None:
@@ -376,18 +397,15 @@ def _print_table(table: TextTable) -> None:
         print(note)
 
 
-def _write_report(results: Path, path: Path, worst: int) -> None:
+def _write_report(results: Results, table: pa.Table, path: Path, worst: int) -> None:
     from limsim_jax.report.page import write_report
-    from limsim_jax.sweep.store import open_results
-
-    opened = open_results(results)
 
     @functools.cache
     def episodes(scenario: str, policy: str) -> Episodes:
-        return _rebuild(opened, scenario, policy)
+        return _rebuild(results, scenario, policy)
 
     def again(scenario: str, policy: str, seed: int) -> tuple[Any, ...]:
         return episodes(scenario, policy).replay(seed)
 
-    write_report(opened, path, replayer=again, worst=worst, say=print)
+    write_report(results, path, replayer=again, worst=worst, say=print, table=table)
     print(f"wrote {path}")
