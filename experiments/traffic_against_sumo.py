@@ -728,6 +728,10 @@ pasubio_tls.add.xml and every fourth vehicle.
   the lane of their exit, four fifths of them on the outermost, and wait for one another.
 - limsim_bigInter jams in ours when vehicles that have entered on a gap meet others inside: priority is not
   transitive there (E0 yields to -E1, which yields to E2, whose path E0 blocks).
+- Red lights are crossed by the ACC-IDM only, above all in bologna_pasubio: with b = 4.5 m/s^2 it begins to
+  brake late, and may then be unable to stop. The IDM crosses none.
+- limsim_town05 and bologna_pasubio count as gridlocked as soon as one vehicle stands for 120 s, which happens
+  behind long red phases and missed turns; traffic as a whole goes on but in one run of town05.
 - SUMO looks for collisions along lanes. Ours compares bodies, so it also finds those who touch beside
   one another where lanes come close.
 - Vehicles that stand for 300 s are teleported by SUMO. Ours stay, and hold up all behind them.

@@ -41,6 +41,7 @@ class Look(NamedTuple):
     traffic: TrafficStep
     other: Int[Array, " N"]  # the second lane of who changes lanes
     way: Int[Array, "N D"]  # lanes to come
+    stopped: Bool[Array, ""]  # the ego has stopped at the stop sign ahead
 
 
 class Judged(NamedTuple):
@@ -50,6 +51,7 @@ class Judged(NamedTuple):
     traffic: TrafficCarry
     goal: Int[Array, ""]  # of the ego at the start: another one is no arrival
     lane: Int[Array, ""]  # of the ego, a step ago
+    stopped: Bool[Array, ""]  # at the stop sign at its end
     to_go: Float[Array, ""]  # m, when the goal could last be reached
 
 
@@ -77,6 +79,7 @@ class EvaluateEgo:
             traffic=traffic.init(slots, 0),
             goal=state.goal[slot],
             lane=state.lane[slot],
+            stopped=jnp.zeros((), bool),
             to_go=jnp.float32(0),
         )
         return self._step(config, lane_map, carry, first, jnp.ones(slots, bool))
@@ -123,6 +126,7 @@ class EvaluateEgo:
             to_go=to_go,
             on_route=distance < _FAR,
             arrived=leaves | reached,
+            stop_sign=seen.stop_sign & ~carry.stopped,
         )
         handed_over = look.traffic.s <= look.traffic.dx
         changed = look.traffic.active & carry.traffic.active & (look.traffic.lane != carry.traffic.lane)
@@ -133,6 +137,7 @@ class EvaluateEgo:
             traffic=traffic.update(carry.traffic, none, flow),
             goal=carry.goal,
             lane=jnp.where(lane == NO_LANE, carry.lane, lane),
+            stopped=((lane == carry.lane) & carry.stopped) | look.stopped,
             to_go=to_go,
         )
 
@@ -166,7 +171,7 @@ def _look(
     entered = state.active & (state.previous != NO_LANE) & (state.s <= dx) & (dx > 0)
     before_line = state.s - dx + lane_map.length[state.previous]
     before_line = before_line <= lane_map.stop_s[state.previous] + _ON_LINE
-    signed = table.must_stop[table.connector[lane]] & ~state.stopped[slot]
+    signed = table.must_stop[table.connector[lane]]
 
     # lights: who drives in the junction after crossing on red has no right to
     ran = ((state.status & int(Status.RED_LIGHT)) != 0) & (lane_map.junction[state.lane] >= 0)
@@ -235,6 +240,7 @@ def _look(
         ),
         other=other_lane(lane_map, state)[0],
         way=state.lane[:, None],
+        stopped=state.stopped[slot],
     )
 
 
