@@ -16,7 +16,7 @@ from limsim_jax import bundled_map
 from limsim_jax.bench import bench_traffic
 
 RESULTS = Path(__file__).parent / "results"
-CASES = (("highway", 64), ("intersection", 64), ("roundabout", 64), ("highway", 256))
+CASES = (("highway", 64), ("intersection", 64), ("roundabout", 64), ("highway", 256), ("highway", 1024))
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -135,7 +135,7 @@ def test_errors_of_workers_come_as_they_are(tmp_path):
     with pytest.raises(ValueError, match=r"^paper\.toml: no such file$"):
         sweep_on_ray(no_episodes, range(40), tmp_path / "b", workers=1)
     with pytest.raises(ValueError, match="workers are not alike: flat/still: 'code' is"):
-        sweep_on_ray(unlike, range(400), tmp_path / "c", workers=2)
+        sweep_on_ray(unlike, range(4000), tmp_path / "c", workers=2)
     with pytest.raises(ValueError, match=r"0 workers\? at least 1"):
         sweep_on_ray(both, range(40), tmp_path / "d", workers=0)
     with pytest.raises(ValueError, match="no seeds"):
