@@ -161,20 +161,10 @@ def build_traffic(
     from limsim_jax.traffic.demand import Flow, beginnings, build_demand, entries
     from limsim_jax.traffic.vehicles import default_population, fitting
 
-    if vehicles < 0:
-        raise ValueError(f"{vehicles} vehicles at the start? 0 or more")
     origins = list(entries(network)) or beginnings(network, 12)
     flows = [Flow(origin=name, rate=rate) for name in origins]
     goals, population = default_goals(network), fitting(default_population(), lane_map)
-    km = sum(lane.length for lane in network.drivable_lanes() if lane.junction is None) / 1e3
-
-    def build(density: float) -> Demand:
-        return build_demand(network, lane_map, goals, flows, population, horizon=seconds, density=density)
-
-    density = vehicles / max(km, 1e-3)
-    demand = build(density)
-    if demand.initial not in (0, vehicles):  # lanes that are closed to all types have no places
-        demand = build(density * vehicles / demand.initial)
+    demand = build_demand(network, lane_map, goals, flows, population, horizon=seconds, vehicles=vehicles)
     return demand, len(origins)
 
 

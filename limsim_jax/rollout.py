@@ -10,9 +10,9 @@ give the same bits. A run that is saved and resumed ends as one that was not.
 
 from __future__ import annotations
 
+import io
 import math
 import os
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,6 +26,7 @@ from jax import lax
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from limsim_jax.files import write_whole
 from limsim_jax.maps.cache import directory
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.numerics import mapped_like
@@ -289,6 +290,14 @@ def world_key(seed: int | Int[Array, ""]) -> Key[Array, ""]:
     return jax.random.fold_in(jax.random.key(0), seed)
 
 
+def one_world(
+    run: Rollout, lane_map: LaneMap, sampler: Callable[[Key[Array, ""]], Scenario], seed: int | Int[Array, ""]
+) -> Result:
+    """The world of a seed from start to end; the same whether it runs alone or in a batch."""
+    scenario_key, policy_key = jax.random.split(world_key(seed))
+    return run(lane_map, sampler(scenario_key), policy_key)
+
+
 class Worlds:
     """Many worlds of one shape: compiled once, run in chunks over all local devices.
 
@@ -317,8 +326,7 @@ class Worlds:
         self.lane_map = jax.device_put(lane_map, jax.sharding.NamedSharding(self.mesh, PartitionSpec()))
 
         def one(lane_map: LaneMap, seed: Int[Array, ""]) -> Result:
-            scenario_key, policy_key = jax.random.split(world_key(seed))
-            return run(lane_map, sampler(scenario_key), policy_key)
+            return one_world(run, lane_map, sampler, seed)
 
         worlds = PartitionSpec("worlds")
         self._run: Any = jax.jit(
@@ -367,18 +375,11 @@ def fork(tree: Any, n: int) -> Any:
 
 def save(path: str | Path, tree: Any) -> None:
     """Write any pytree of arrays (a state, a carry of `Rollout.go_on`) as .npz; never half a file."""
-    path = Path(path)
     found = jax.tree_util.tree_leaves_with_path(tree)
     leaves: dict[str, Any] = {jax.tree_util.keystr(where): np.asarray(x) for where, x in found}
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-        try:
-            np.savez(file, **leaves)
-            file.flush()
-            os.fsync(file.fileno())
-            os.replace(file.name, path)
-        except BaseException:
-            os.unlink(file.name)
-            raise
+    file = io.BytesIO()
+    np.savez(file, **leaves)
+    write_whole(path, file.getvalue())
 
 
 def load(path: str | Path, like: Any) -> Any:

@@ -14,6 +14,7 @@ PACKAGE = REPO / "limsim_jax"
 
 # Rooms from the ground up: a module imports from its own room and from rooms before it.
 ORDER = [
+    {"files"},
     {"numerics"},
     {"geometry"},
     {"types"},

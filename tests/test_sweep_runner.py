@@ -17,8 +17,9 @@ import pytest
 from conftest import REPO
 from fake_episodes import FakeEpisodes, both
 
+from limsim_jax import files
 from limsim_jax.metrics.intervals import bootstrap, wilson
-from limsim_jax.sweep import runner, store
+from limsim_jax.sweep import runner
 from limsim_jax.sweep.runner import Progress, run_here, sweep, verify
 from limsim_jax.sweep.store import Results, ResultsError, open_results
 
@@ -223,7 +224,7 @@ def test_killed_at_every_step_of_every_write(tmp_path, monkeypatch, call):
         left = points
         with monkeypatch.context() as patch:
             if call == "open":
-                patch.setattr(store, "open", dying, raising=False)
+                patch.setattr(files, "open", dying, raising=False)
             else:
                 patch.setattr(os, call, dying)
             try:
@@ -280,6 +281,21 @@ def test_looks_double_in_whole_chunks():
     assert runner._looks(1000, 256) == [256, 512, 1000]
     assert runner._looks(128, 64) == [128]
     assert runner._looks(5, 64) == [5]
+
+
+def test_a_scenario_is_not_charged_for_those_before_it(tmp_path):
+    slow, quick = FakeEpisodes(delay=0.2), FakeEpisodes("hilly")
+    first, second = sweep([slow, quick], range(16), tmp_path).parts
+    assert first.elapsed > 0.4 > second.elapsed
+
+
+def test_a_goal_that_is_reached_on_disk_compiles_nothing(tmp_path):
+    goal = (0.05, "success")
+    before = sweep([FakeEpisodes(chunk=32)], range(4000), tmp_path, until_ci=goal).parts
+    fake = FakeEpisodes(chunk=32)
+    after = sweep([fake], range(4000), tmp_path, until_ci=goal).parts
+    assert fake.compiled == 0 and fake.ran == []
+    assert after[0].interval == before[0].interval and after[0].reached
 
 
 def test_a_sweep_stops_once_the_interval_is_narrow(tmp_path):
@@ -422,7 +438,7 @@ def test_a_full_disk_stops_the_sweep_and_it_goes_on_later(tmp_path, monkeypatch)
         writes += 1
         return open("/dev/full" if writes > 6 else path, "wb")
 
-    monkeypatch.setattr(store, "open", full, raising=False)
+    monkeypatch.setattr(files, "open", full, raising=False)
     with pytest.raises(ResultsError, match=r"No space left on device.*what is finished is kept"):
         sweep(both(), range(40), out)
     monkeypatch.undo()

@@ -14,6 +14,7 @@ import pytest
 from conftest import REPO
 from fake_episodes import FakeEpisodes, both
 
+from limsim_jax import files
 from limsim_jax.sweep import store
 from limsim_jax.sweep.store import DamagedError, Entry, Outcome, ResultsError, Shards, open_results, register
 
@@ -253,7 +254,7 @@ def test_leftovers_of_killed_writers_are_ignored_and_removed_when_old(tmp_path):
 def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch):
     fake = FakeEpisodes()
     (shards,) = filled(tmp_path, fake)
-    monkeypatch.setattr(store, "open", lambda path, mode: open("/dev/full", "wb"), raising=False)
+    monkeypatch.setattr(files, "open", lambda path, mode: open("/dev/full", "wb"), raising=False)
     with pytest.raises(
         ResultsError, match=r"moments-00000008-00000009.*cannot be written \(No space"
     ) as error:

@@ -22,7 +22,6 @@ from traffic_worlds import bundled
 
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES, absolute, lane_ids, lane_rows, pose
 from limsim_jax.maps.signals import SignalState
-from limsim_jax.report import viewer
 from limsim_jax.report.video import EGO, SIGNALS
 from limsim_jax.report.viewer import write_viewer
 from limsim_jax.rollout import Trace
@@ -441,7 +440,7 @@ def test_the_file_is_written_whole_or_not_at_all(world, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
-        patch.setattr(viewer.os, "fsync", full)
+        patch.setattr(os, "fsync", full)
         write_viewer(path, network, lane_map, trace)
     assert [file.name for file in tmp_path.iterdir()] == ["a.html"] and path.read_text() == "as before"
     with pytest.raises(OSError, match="nowhere"):

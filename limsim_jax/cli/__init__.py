@@ -241,7 +241,7 @@ def run(
     from limsim_jax.bench import RATE, build_traffic
     from limsim_jax.maps import build_lane_map
     from limsim_jax.maps.network import MapError
-    from limsim_jax.rollout import Result, Rollout, enable_compilation_cache, trace, world_key
+    from limsim_jax.rollout import Result, Rollout, enable_compilation_cache, one_world, trace
     from limsim_jax.traffic.demand import sample_scenario
     from limsim_jax.traffic.engine import Traffic
     from limsim_jax.types import Config
@@ -266,8 +266,7 @@ def run(
     @jax.jit
     def world(arrays: list[Any], seed: Any) -> Result:  # the world of this seed in a batch, too
         lane_map = jax.tree.unflatten(structure, arrays)
-        scenario_key, policy_key = jax.random.split(world_key(seed))
-        return rollout(lane_map, sample_scenario(demand, lane_map, scenario_key, slots), policy_key)
+        return one_world(rollout, lane_map, lambda key: sample_scenario(demand, lane_map, key, slots), seed)
 
     enable_compilation_cache()
     start = time.perf_counter()

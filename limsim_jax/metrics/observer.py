@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -73,7 +72,7 @@ class EvaluateEgo:
         ego, traffic = self._judges(config)
         slots, slot = state.lane.shape[0], state.egos.slot[0]
         nothing = jnp.zeros(slots, jnp.float32)
-        first = _look(config, lane_map, state, state.active & False, jnp.zeros((), jnp.float32), nothing)
+        first = _look(lane_map, state, state.active & False, jnp.zeros((), jnp.float32), nothing)
         carry = Judged(
             ego=ego.init(slots, first.ego.zones.id.shape[0]),
             traffic=traffic.init(slots, 0),
@@ -86,7 +85,7 @@ class EvaluateEgo:
 
     def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Look:
         """What the metrics need to know of a physics step."""
-        look = _look(config, lane_map, tick.state, tick.left, tick.time, tick.dx)
+        look = _look(lane_map, tick.state, tick.left, tick.time, tick.dx)
         slot = tick.state.egos.slot[0]
         other, gap = (x[slot, 0] for x in tick.decision.obstacles)
         gap = gap + tick.x[other] - tick.x[slot]
@@ -100,8 +99,7 @@ class EvaluateEgo:
 
     def update(self, config: Config, lane_map: LaneMap, carry: Judged, looks: Look) -> Judged:
         """Pass the looks since the last decision through the metrics."""
-        one = jax.tree.map(lambda x: x[0], looks)
-        relevant = _meets_ego(lane_map, one.ego.slot, one.way, looks.other.max(0))
+        relevant = _meets_ego(lane_map, looks.ego.slot[0], looks.way[0], looks.other.max(0))
 
         def step(carry: Judged, look: Look) -> tuple[Judged, None]:
             return self._step(config, lane_map, carry, look, relevant), None
@@ -150,7 +148,6 @@ class EvaluateEgo:
 
 
 def _look(
-    config: Config,
     lane_map: LaneMap,
     state: State,
     left: Bool[Array, " N"],

@@ -25,6 +25,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from limsim_jax.files import write_whole
 from limsim_jax.report.tables import (
     CRASH_RATE,
     MAIN,
@@ -173,7 +174,7 @@ def write_report(
     template = Template((Path(__file__).with_name("page.html")).read_text(encoding="utf-8"))
     title = f"{Path(names.path).name or names.path}: sweep report"
     text = template.substitute(title=escape(title), body="\n".join(sections))
-    path.write_text(text, encoding="utf-8")
+    write_whole(path, text)
     return path
 
 

@@ -13,7 +13,6 @@ import base64
 import html
 import json
 import math
-import os
 import re
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
+from limsim_jax.files import write_whole
 from limsim_jax.maps.draw import _KINDS, _TRAFFIC, JUNCTION, _halfplane, _kind, _prepare, _Shape, _view
 from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, LaneMap, absolute, lane_ids
 from limsim_jax.maps.network import Control, Network
@@ -159,16 +159,7 @@ def _write(path: Path, meta: dict[str, Any], pack: _Pack) -> None:
     parts = {"TITLE": html.escape(meta["title"]), "DATA": base64.b64encode(block).decode()}
     template = Path(__file__).with_name("viewer.html").read_text("utf-8")
     page = re.sub("{{(TITLE|DATA)}}", lambda found: parts[found[1]], template)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(page)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    write_whole(path, page)
 
 
 # --- what comes in -----------------------------------------------------------------------------------

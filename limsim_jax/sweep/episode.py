@@ -38,8 +38,8 @@ from limsim_jax.rollout import (
     Trace,
     Worlds,
     enable_compilation_cache,
+    one_world,
     trace,
-    world_key,
 )
 from limsim_jax.sweep.experiment import Bounds, EgoTable, Experiment, ExperimentError
 from limsim_jax.sweep.store import Outcome
@@ -109,7 +109,7 @@ class Episodes:
 
     def __init__(self, experiment: Experiment, *, chunk: int | None = None) -> None:
         self.experiment = experiment
-        self.scenario, self.policy, self.horizon = experiment.name, experiment.policy, experiment.horizon
+        self.scenario, self.policy = experiment.name, experiment.policy
         self.units = UNITS
         self._check_success()
         self._policy = _policy(experiment)
@@ -248,8 +248,7 @@ class Episodes:
     def _one(self) -> Callable[..., Result]:
         def one(lane_map: LaneMap, seed: jax.Array, slot: jax.Array, at: jax.Array) -> Result:
             run = replace(self._run, record=trace, policy=_Braking(self._policy, slot, at))
-            scenario_key, policy_key = jax.random.split(world_key(seed))  # as `Worlds` does
-            return run(lane_map, self._sample(scenario_key), policy_key)
+            return one_world(run, lane_map, self._sample, seed)
 
         enable_compilation_cache()
         return jax.jit(one)
@@ -419,20 +418,10 @@ def _demand(
     try:
         population = default_population(traffic.mix) if traffic.mix is not None else default_population()
         population = fitting(population, lane_map)
-
-        def build(density: float) -> Demand:
-            return build_demand(
-                network, lane_map, goals, flows, population, horizon=experiment.horizon, density=density,
-                egos=egos,
-            )  # fmt: skip
-
-        if traffic.vehicles is None:
-            return build(traffic.density)
-        km = sum(lane.length for lane in network.drivable_lanes() if lane.junction is None) / 1000
-        demand = build(traffic.vehicles / max(km, 1e-3))
-        if demand.initial not in (0, traffic.vehicles):  # lanes that are closed to all have no places
-            demand = build(traffic.vehicles / max(km, 1e-3) * traffic.vehicles / demand.initial)
-        return demand
+        return build_demand(
+            network, lane_map, goals, flows, population, horizon=experiment.horizon, density=traffic.density,
+            vehicles=traffic.vehicles, egos=egos,
+        )  # fmt: skip
     except ValueError as error:
         raise ExperimentError(f"{experiment.name}: traffic: {error}") from None
 

@@ -22,7 +22,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -166,13 +166,16 @@ def sweep(
         mine = _of_shard(seeds, one.chunk, shard)
         tell, shards = _Teller(one, len(mine), progress), Shards(out, entry)
         jobs.append((one, shards, mine, _missing(shards, mine, tell, damaged), tell))
-    # the next scenario compiles while this one runs
     with ThreadPoolExecutor(COMPILERS) as pool:
-        compiling = [pool.submit(one.compile) if missing else None for one, _, _, missing, _ in jobs]
+        # The next scenario compiles while this one runs; but who may stop early may need no more worlds.
+        ready = [
+            pool.submit(one.compile).result if missing and until_ci is None else one.compile
+            for one, _, _, missing, _ in jobs
+        ]
         try:
             parts = [
                 _sweep_one(*job, compiled, until_ci, run_chunks)
-                for job, compiled in zip(jobs, compiling, strict=True)
+                for job, compiled in zip(jobs, ready, strict=True)
             ]
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -211,19 +214,20 @@ def _sweep_one(
     seeds: list[int],
     missing: set[int],
     tell: _Teller,
-    compiled: Future[None] | None,
+    compiled: Callable[[], None],
     until_ci: tuple[float, str] | None,
     run_chunks: RunChunks,
 ) -> Part:
     size = episodes.chunk
     looks = _looks(len(seeds), size) if until_ci else [len(seeds)]
-    interval, reached, ran = None, False, 0
+    interval, reached, waited, ran = None, False, False, 0
+    tell.start()
     for first, last in zip([0, *looks], looks, strict=False):
         todo = [seed for seed in seeds[first:last] if seed in missing]
-        if todo and compiled is not None:
+        if todo and not waited:
             tell("compiling")
-            compiled.result()
-            compiled = None
+            compiled()
+            waited = True
             tell.begin()
         if todo:
             tell("running")
@@ -261,6 +265,10 @@ class _Teller:
         self.progress = progress
         self.done = self.fresh = 0
         self.km = self.contacts = 0.0
+        self.start()
+
+    def start(self) -> None:
+        """It is the turn of this scenario."""
         self.started = self.began = time.monotonic()
 
     def begin(self) -> None:

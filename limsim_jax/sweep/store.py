@@ -21,7 +21,6 @@ import os
 import re
 import tempfile
 import time
-import uuid
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,6 +31,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+
+from limsim_jax.files import write_whole
 
 FORMAT = 1
 """Version of the layout of a results directory."""
@@ -533,25 +534,8 @@ def _checksum(table: pa.Table, about: Mapping[str, Any]) -> str:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """All of it under its name, or nothing; safe from a power cut once this returns."""
-    part = path.with_name(f"{path.name}.{uuid.uuid4().hex[:12]}.part")
     with _clear(path):
-        try:
-            with open(part, "xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                part.unlink()
-            raise
-        if hasattr(os, "O_DIRECTORY"):  # there, a new name is safe only once the directory is
-            folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+        write_whole(path, data)
 
 
 @contextlib.contextmanager

@@ -238,6 +238,7 @@ def build_demand(
     *,
     horizon: float,
     density: float = 0.0,
+    vehicles: int | None = None,
     egos: EgoStart | None = None,
 ) -> Demand:
     """Check flows and density, and lay them out for `sample_scenario`.
@@ -251,6 +252,7 @@ def build_demand(
       population: whom to draw from.
       horizon: s; nobody comes after it.
       density: vehicles at the start per km of lane outside junctions.
+      vehicles: instead of that, how many there are at the start.
       egos: vehicles under test; nobody else starts on top of them, nor within `EGO_ROOM` on their lanes.
 
     Raises:
@@ -261,12 +263,22 @@ def build_demand(
         raise ValueError(f"horizon = {horizon:g} s; it has to be positive and finite")
     if not 0 <= density < math.inf:
         raise ValueError(f"density = {density:g} veh/km; it has to be 0 or more, and finite")
+    if vehicles is not None and vehicles < 0:
+        raise ValueError(f"{vehicles} vehicles at the start? 0 or more")
     world = _World.of(network, lane_map, goals, population)
     streams: list[_Stream] = []
     for i, flow in enumerate(flows):
         streams += _streams(world, flow, i, horizon)
     wanted = sum((s.rate * s.goals for s in streams), np.zeros(world.reachable.shape[1]))
-    arrays = _lay_out(world, streams) | _seats(world, density, wanted, egos)
+    if vehicles is None:
+        seats = _seats(world, density, wanted, egos)
+    else:
+        km = sum(lane.length for lane in network.drivable_lanes() if lane.junction is None) / 1e3
+        density = vehicles / max(km, 1e-3)
+        seats = _seats(world, density, wanted, egos)
+        if seats["initial"] not in (0, vehicles):  # lanes that are closed to all types have no places
+            seats = _seats(world, density * vehicles / seats["initial"], wanted, egos)
+    arrays = _lay_out(world, streams) | seats
     return jax.tree.map(jnp.asarray, Demand(population=population, **arrays))
 
 
