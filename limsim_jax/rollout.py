@@ -33,6 +33,7 @@ from limsim_jax.numerics import mapped_like
 from limsim_jax.policies.base import LikeTraffic, Policy
 from limsim_jax.traffic.collision import collided
 from limsim_jax.traffic.demand import delayed
+from limsim_jax.traffic.ego import with_rows
 from limsim_jax.traffic.engine import Tick, Traffic, drive
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, Scenario, Schedule, State, Status
@@ -175,6 +176,7 @@ class Rollout:
 
     def begin(self, lane_map: LaneMap, state: State) -> Carry:
         """Before the first decision."""
+        state = replace(state, egos=with_rows(state.egos, getattr(self.policy, "others", 0)))
         memory = self.policy.init(self.config, lane_map, state)
         measured = None if self.measure is None else self.measure.init(self.config, lane_map, state)
         return mapped_like(state.s, Carry(state, memory, no_totals(state), measured))

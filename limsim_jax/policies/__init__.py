@@ -7,10 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic, Policy
+from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.simple import ConstantSpeed
 
 POLICIES: dict[str, Callable[..., Policy]] = {
     "like_traffic": LikeTraffic,
     "constant_speed": ConstantSpeed,
+    "limsim_tm": LimSimTM,
+    "area_of_interest": AreaOfInterest,
 }

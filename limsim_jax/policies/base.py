@@ -17,6 +17,8 @@ class Policy(Protocol):
 
     free: bool
     """Whether its egos move in the plane, by a trajectory or by controls, or keep to lanes."""
+    others: int
+    """How many vehicles of the traffic it can drive at a time beside the egos: rows of `State.egos`."""
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         """The memory at the start: any pytree, of the same shapes ever after."""
@@ -33,6 +35,7 @@ class LikeTraffic:
     """The egos drive as all traffic does: car following, lane changes, right of way."""
 
     free = False
+    others = 0
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         """Nothing to remember."""

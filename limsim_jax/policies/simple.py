@@ -30,6 +30,7 @@ class ConstantSpeed:
     look_ahead: float = 0.8
 
     free = True
+    others = 0
 
     def __post_init__(self) -> None:
         if self.speed is not None and not self.speed >= 0:

@@ -258,7 +258,7 @@ class _Braking:
     """A policy, and a vehicle that brakes from some moment on."""
 
     def __init__(self, policy: Policy, slot: jax.Array, at: jax.Array) -> None:
-        self.free = policy.free
+        self.free, self.others = policy.free, getattr(policy, "others", 0)
         self.init = policy.init
         self.policy, self.slot, self.at = policy, slot, at
 

@@ -376,6 +376,35 @@ def sync(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> State:
     )
 
 
+def with_rows(egos: Egos, more: int) -> Egos:
+    """Egos and `more` rows that drive nobody yet: `assign` gives them vehicles."""
+    if not more:
+        return egos
+    pad = {name: jnp.zeros(more, getattr(egos, name).dtype) for name in ("free", "x", "y", "heading")}
+    pad |= {"steering": pad["x"], "a": pad["x"], "slot": jnp.full(more, -1, egos.slot.dtype)}
+    return Egos(**{name: jnp.concatenate([getattr(egos, name), value]) for name, value in pad.items()})
+
+
+def assign(lane_map: LaneMap, state: State, box: Float[Array, "N 5"], slot: Int[Array, " E"]) -> State:
+    """Let the rows of `Egos` drive the vehicles in `slot`, -1 for nobody; `box`: `motion.boxes`.
+
+    Who is taken starts in the plane where it is, at its speed and acceleration. Who is given back goes on
+    along its lane from where it is; off the middle it drifts back (`motion.advance`). Rows whose vehicle
+    stays are not touched.
+    """
+    egos = state.egos
+    new = (slot != egos.slot) & (slot >= 0)
+    taken = sync(lane_map, replace(state, egos=replace(egos, slot=slot, free=egos.free & ~new)), box).egos
+    drives = jnp.where(new, True, egos.free & (slot == egos.slot)) & (slot >= 0)
+    state = replace(state, egos=replace(taken, free=drives))
+    # a free body has no lane change in progress; who becomes one keeps no half of an old one
+    nothing = jnp.zeros_like(slot)
+    side = at_slots(state.egos, nothing, state.side, new)
+    given = (egos.slot >= 0) & (egos.slot[:, None] != slot[None, :]).all(1) & egos.free
+    side = at_slots(egos, nothing, side, given)
+    return replace(state, side=side)
+
+
 def arrived(lane_map: LaneMap, state: State) -> Bool[Array, " E"]:
     """Egos whose front bumper has passed the end of their goal."""
     slot = state.egos.slot

@@ -27,6 +27,7 @@ from limsim_jax.traffic.ego import (
     Control,
     Limits,
     Trajectory,
+    assign,
     at_slots,
     is_free,
     meta_acceleration,
@@ -86,6 +87,7 @@ class Command:
     control: Control | None = None
     meta: Int[Array, " E"] | None = None  # `Meta`, or -1: decide like the traffic
     brake: Bool[Array, " N"] | None = None  # who brakes as hard as it can, egos or others
+    slot: Int[Array, " E"] | None = None  # whom each row of `Egos` drives from now on, -1: nobody
 
 
 class Tick(NamedTuple):
@@ -273,6 +275,8 @@ def drive(
     if traffic.look_for_contacts not in ("step", "decision"):
         raise ValueError(f"look for contacts every '{traffic.look_for_contacts}'? known are step, decision")
     command = Command() if command is None else command
+    if command.slot is not None:
+        state = assign(lane_map, state, boxes(lane_map, state), command.slot)
     if schedule is not None:
         state = enter(config, lane_map, schedule, state)
     state, decision = decide(config, traffic, lane_map, state, command)

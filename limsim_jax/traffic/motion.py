@@ -29,6 +29,7 @@ CREEP_SPEED = 5.0
 """m/s, below which a lane change goes on by distance, not by time: what stands does not slide."""
 
 _STEEPEST = math.tan(0.2)  # way against the lane in a lane change: the ends of long bodies stay near theirs
+_DRIFT = 0.5  # m/s back to the middle of the lane
 _GOAL = -2  # in place of the next lane, at the end of a goal
 _HAND_OVERS = 3  # lanes that a vehicle may leave behind in one step
 _BUMPER, _HALT = 0.4, 2.5  # m beyond the place to stop, still before the line; m/s^2 used there
@@ -167,6 +168,8 @@ def _move_sideways(config: Config, lane_map: LaneMap, state: State) -> State:
     rate = jnp.minimum(state.v / CREEP_SPEED, 1)
     done = state.progress + rate * safe_divide(jnp.full_like(rate, config.dt), state.driver.lane_change_time)
     progress = jnp.where(changing, jnp.minimum(done, 1), 0)
+    # who is off the middle without changing lanes, as after somebody else has driven it, drifts back
+    drift = jnp.sign(state.d) * jnp.maximum(jnp.abs(state.d) - _DRIFT * rate * config.dt, 0)
     offset = state.shift * (1 - smooth_step(progress))  # from the centre of the lane that it moves to
     beside = jnp.where(state.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
     s_beside = side_s(lane_map, state.lane, state.s, state.side)
@@ -188,7 +191,11 @@ def _move_sideways(config: Config, lane_map: LaneMap, state: State) -> State:
             state.previous,
         ),
         s=jnp.where(crosses, s_beside, state.s),
-        d=jnp.where(changing & ~finished, jnp.where(crosses, d - side * between, d), 0),
+        d=jnp.where(
+            changing,
+            jnp.where(finished, 0, jnp.where(crosses, d - side * between, d)),
+            jnp.where(state.active, drift, 0),
+        ),
         side=jnp.where(finished, 0, state.side),
         crossed=(state.crossed | crosses) & changing & ~finished,
         progress=jnp.where(finished, 0, progress),

@@ -1,0 +1,219 @@
+"""Area of Interest: planners for the few vehicles that matter to the egos, IDM and MOBIL for all others.
+
+The number of expensive places is fixed, so the cost of a world is, too. Who is planned for changes as the
+egos drive: whoever comes near gets a place, whoever is far gives it up, and the vehicle goes on from where
+it is, at the speed and acceleration that it has.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.policies.base import Policy
+from limsim_jax.traffic.ego import Egos, Trajectory, assign
+from limsim_jax.traffic.engine import Command
+from limsim_jax.traffic.motion import boxes
+from limsim_jax.types import Config, State, Status
+
+
+class Places(NamedTuple):
+    """Memory of the area: `K` places, and the memories of the policies."""
+
+    slot: Int[Array, " K"]  # who has it, -1: nobody
+    entered: Float[Array, " K"]  # s, when that vehicle entered the world: tells vehicles of a slot apart
+    since: Float[Array, " K"]  # s, when it got the place
+    switches: Int[Array, ""]  # places given to somebody else so far
+    inner: Any
+
+
+@dataclass(frozen=True)
+class AreaOfInterest:
+    """Drives the egos, and the vehicles around them that matter most, by planners.
+
+    Attributes:
+      around: the planner of the vehicles around: a free policy, or its name and `options`.
+      ego: the planner of the egos; None: the same one.
+      slots: vehicles beside the egos that can be planned for at a time.
+      radius: m from the nearest ego, within which a vehicle gets a place.
+      leave: m, beyond which it gives it up.
+      dwell: s that it keeps a place at least.
+      options: arguments of `around` if that is a name.
+    """
+
+    around: Policy | str = "limsim_tm"
+    ego: Policy | str | None = None
+    slots: int = 8
+    radius: float = 50.0
+    leave: float | None = None
+    dwell: float = 3.0
+    options: dict[str, Any] = field(default_factory=dict)
+
+    free = True
+
+    def __post_init__(self) -> None:
+        if self.slots < 1:
+            raise ValueError(f"slots: {self.slots}; at least 1")
+        if not self.radius > 0:
+            raise ValueError(f"radius: {self.radius} m; it has to be above 0")
+        if self.leave is not None and self.leave < self.radius:
+            raise ValueError(f"leave: {self.leave} m; not less than the radius of {self.radius} m")
+        around = _named(self.around, self.options)
+        if not around.free:
+            raise ValueError("around: a policy that keeps to lanes; it needs one that moves in the plane")
+        object.__setattr__(self, "around", around)
+        if self.ego is not None:
+            object.__setattr__(self, "ego", _named(self.ego, {}))
+            object.__setattr__(self, "free", self.ego.free)  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def others(self) -> int:
+        """Vehicles beside the egos that can be planned for."""
+        return self.slots
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Places:
+        """No place is taken."""
+        none = jnp.full(self.slots, -1, state.egos.slot.dtype)
+        zero = jnp.zeros(self.slots, jnp.float32)
+        return Places(none, zero, zero, jnp.int32(0), self._begin(config, lane_map, state))
+
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: Places, key: jax.Array
+    ) -> tuple[Command, Places]:
+        """Give out the places anew, then plan."""
+        now = config.time(state.step)
+        places = self._choose(lane_map, state, memory, now)
+        count = state.egos.slot.shape[0] - self.slots
+        slot = jnp.concatenate([state.egos.slot[:count], places.slot])
+        fresh = slot != state.egos.slot
+        state = assign(lane_map, state, boxes(lane_map, state), slot)
+        # who is new in a place has no memory
+        begin = self._begin(config, lane_map, state)
+        inner = jax.tree.map(lambda new, old: _rows_where(fresh, new, old), begin, places.inner)
+        command, inner = self._drive(config, lane_map, state, inner, key)
+        return replace(command, slot=slot), places._replace(inner=inner)
+
+    def _parts(self, state: State) -> list[tuple[Any, State]]:
+        """The policies, and the rows of egos that each of them drives."""
+        if self.ego is None:
+            return [(self.around, state)]
+        count = state.egos.slot.shape[0] - self.slots
+        parts = (slice(None, count), slice(count, None))
+        rows = [jax.tree.map(lambda x: x[part], state.egos) for part in parts]  # noqa: B023
+        return [(p, replace(state, egos=egos)) for p, egos in zip((self.ego, self.around), rows, strict=True)]
+
+    def _begin(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        return tuple(policy.init(config, lane_map, some) for policy, some in self._parts(state))
+
+    def _drive(
+        self, config: Config, lane_map: LaneMap, state: State, inner: Any, key: jax.Array
+    ) -> tuple[Command, Any]:
+        found = [
+            policy(config, lane_map, some, memory, jax.random.fold_in(key, k))
+            for k, ((policy, some), memory) in enumerate(zip(self._parts(state), inner, strict=True))
+        ]
+        commands, inner = zip(*found, strict=True)
+        if len(commands) == 1:
+            return commands[0], inner
+        return _joined(commands[0], commands[1], state.egos), inner
+
+    def _choose(self, lane_map: LaneMap, state: State, memory: Places, now: Float[Array, ""]) -> Places:
+        """Who has the places from now on; who keeps one keeps the same."""
+        number = state.lane.shape[0]
+        egos = state.egos
+        count = egos.slot.shape[0] - self.slots
+        here = boxes(lane_map, state)[:, :2]
+        mine = egos.slot[:count]
+        away = jnp.sqrt(jnp.min(jnp.sum((here[:, None] - here[mine][None]) ** 2, -1), -1))  # [N]
+        is_ego = (jnp.arange(number)[:, None] == mine[None]).any(-1)
+        has = jnp.arange(number)[:, None] == memory.slot[None]  # [N K]
+        same = (memory.slot >= 0) & state.active[memory.slot] & (state.entered[memory.slot] == memory.entered)
+        stays = (has & same[None]).any(-1)
+        young = (has & (same & (now - memory.since < self.dwell))[None]).any(-1)
+
+        # who is about to reach its goal leaves by itself; half a lane change is ended by who began it
+        last = lane_map.routes.is_goal[state.lane, state.goal]
+        leaving = last & (lane_map.length[state.lane] - state.s < 3.0 * state.v + 10.0)
+        fit = state.active & ~is_ego & ~leaving & ((state.status & int(Status.COLLIDED)) == 0)
+        fit &= stays | ((state.side == 0) & (state.s > state.shape.length))
+        leave = 1.3 * self.radius if self.leave is None else self.leave
+        near = (away < self.radius) | (stays & (away < leave)) | young
+        relevance = jnp.exp(-away / 30.0) + 0.5 * stays + jnp.where(young, 10.0, 0.0)
+        relevance = jnp.where(fit & near, relevance, -1.0)
+        best, who = lax.top_k(relevance, min(self.slots, number))
+        chosen = ((jnp.arange(number)[:, None] == who[None]) & (best > 0)[None]).any(-1)
+
+        keeps = same & chosen[memory.slot]
+        new = chosen & ~(has & keeps[None]).any(-1)
+        order = lax.top_k(jnp.where(new, relevance, -1.0), min(self.slots, number))
+        arrivals = jnp.where(order[0] > 0, order[1], -1)
+        rank = jnp.cumsum(~keeps) - 1
+        arrivals = jnp.pad(arrivals, (0, max(0, self.slots - number)), constant_values=-1)
+        slot = jnp.where(keeps, memory.slot, arrivals[jnp.clip(rank, 0, self.slots - 1)]).astype(
+            memory.slot.dtype
+        )
+        switched = jnp.sum(~keeps & ((slot >= 0) | (memory.slot >= 0)), dtype=jnp.int32)
+        return memory._replace(
+            slot=slot,
+            entered=jnp.where(keeps, memory.entered, state.entered[slot]),
+            since=jnp.where(keeps, memory.since, now),
+            switches=memory.switches + switched,
+        )
+
+
+def _named(policy: Policy | str, options: dict[str, Any]) -> Policy:
+    from limsim_jax.policies import POLICIES
+
+    if not isinstance(policy, str):
+        return policy
+    if policy not in POLICIES or policy == "area_of_interest":
+        known = ", ".join(name for name in POLICIES if name != "area_of_interest")
+        raise ValueError(f"unknown policy '{policy}'; known are {known}")
+    return POLICIES[policy](**options)
+
+
+def _rows_where(fresh: Bool[Array, " E"], new: Array, old: Array) -> Array:
+    """The new values in the rows of the last vehicles that are `fresh`; what has no such rows stays."""
+    rows = fresh.shape[0]
+    if new.ndim and 0 < new.shape[0] <= rows:
+        mask = fresh[rows - new.shape[0] :] if new.shape[0] != rows else fresh
+        return jnp.where(mask.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
+    return old
+
+
+def _joined(first: Command, second: Command, egos: Egos) -> Command:
+    """One command for the rows of both; trajectories on the moments of the second one.
+
+    Raises:
+      ValueError: a policy that gives no trajectory, though its egos are free.
+    """
+    much = second.trajectory
+    if much is None:
+        raise ValueError("around: a planner that gives no trajectories")
+    mine = first.trajectory
+    rows = egos.slot.shape[0] - much.x.shape[0]
+    if mine is None:
+        if first.control is not None:
+            raise ValueError("ego: a planner that gives controls cannot be joined with one of trajectories")
+        values = [jnp.zeros((rows, much.x.shape[1]), much.x.dtype)] * 4
+        meta = None if first.meta is None else jnp.concatenate([first.meta, jnp.full(much.x.shape[0], -1)])
+    else:
+        at = jnp.clip(
+            (jnp.arange(much.x.shape[1]) * much.dt + much.t0 - mine.t0) / mine.dt, 0, mine.x.shape[1] - 1
+        )
+        k = jnp.minimum(at.astype(jnp.int32), mine.x.shape[1] - 2)
+        u = at - k.astype(at.dtype)
+        values = [
+            z[:, k] + u * (z[:, k + 1] - z[:, k]) for z in (mine.x, mine.y, jnp.unwrap(mine.heading), mine.v)
+        ]
+        meta = None
+    x, y, heading, v = (
+        jnp.concatenate([a, b]) for a, b in zip(values, (much.x, much.y, much.heading, much.v), strict=True)
+    )
+    return Command(trajectory=Trajectory(x=x, y=y, heading=heading, v=v, t0=much.t0, dt=much.dt), meta=meta)

@@ -1,0 +1,407 @@
+"""Trajectories along a way: a lattice of speeds, horizons and offsets, of which the cheapest is taken.
+
+Werling, Ziegler, Kammel, Thrun (ICRA 2010): quartics and quintics in time along the way; across it
+quintics over the distance driven, so that also slow vehicles can follow them. Among the samples are always
+car following with several desired speeds, and braking, mild and as hard as possible: some trajectory is
+drivable in any case.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from limsim_jax.policies.reference import Frenet, Way, place_on
+from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
+from limsim_jax.types import Driver
+
+
+class Task(NamedTuple):
+    """What `V` vehicles have ahead of them."""
+
+    way: Way  # the one to follow: of the own lane or of the one to change to
+    start: Frenet
+    length: Float[Array, " V"]  # m
+    width: Float[Array, " V"]
+    driver: Driver  # [V]
+    lead_gap: Float[Array, "V J"]  # m from the front bumper to who is to be followed; NO_GAP: nobody
+    lead_v: Float[Array, "V J"]  # m/s
+    wall: Float[Array, " V"]  # m from the front bumper to the place beyond which it must not go
+    other: Others
+    steering: Float[Array, " V"]  # rad, largest; with `wheelbase` it bounds the curvature
+    wheelbase: Float[Array, " V"]
+
+
+class Others(NamedTuple):
+    """Where `K` others will be at the `H` moments of the plan, for each of `V` vehicles."""
+
+    x: Float[Array, "V K H"]  # m
+    y: Float[Array, "V K H"]
+    heading: Float[Array, "V K H"]  # rad
+    length: Float[Array, "V K"]  # m
+    width: Float[Array, "V K"]
+    counts: Bool[Array, "V K"]  # False: is none of our business
+
+
+class Plan(NamedTuple):
+    """The trajectories that were chosen, from now on; the centre of the body."""
+
+    x: Float[Array, "V H"]  # m
+    y: Float[Array, "V H"]
+    heading: Float[Array, "V H"]  # rad, of the motion
+    v: Float[Array, "V H"]  # m/s
+    cost: Float[Array, " V"]
+    sample: Int[Array, " V"]  # number of the sample that was chosen
+    safe: Bool[Array, " V"]  # no bound is broken and nobody is touched
+
+
+class Samples(NamedTuple):
+    """All trajectories of the lattice: `S` samples at `H` moments, and what speaks against them."""
+
+    s: Float[Array, "V S H"]  # m
+    d: Float[Array, "V S H"]  # m
+    x: Float[Array, "V S H"]  # m
+    y: Float[Array, "V S H"]
+    heading: Float[Array, "V S H"]  # rad
+    v: Float[Array, "V S H"]  # m/s
+    curvature: Float[Array, "V S H"]  # 1/m
+    cost: Float[Array, "V S"]
+    broken: Float[Array, "V S"]  # how much bounds are broken; 0 for what is feasible
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Samples and weights. All static.
+
+    Attributes:
+      horizon: s.
+      dt: s between moments.
+      speeds: end speeds of the quartics, between a standstill and the desired speed.
+      horizons: s in which they are reached.
+      stops: durations of stops at the wall, as multiples of that with constant deceleration.
+      following: desired speeds of the car-following samples, as shares.
+      braking: m/s^2, constant; the hardest is the driver's `b_max`.
+      offsets: m off the middle of the way at the end.
+      lateral_time: s for a change of offset, at driving speed.
+    """
+
+    horizon: float = 5.0
+    dt: float = 0.2
+    speeds: int = 6
+    horizons: tuple[float, ...] = (2.5, 4.5)
+    stops: tuple[float, ...] = (1.0, 1.3)
+    following: tuple[float, ...] = (1.0, 0.75, 0.5)
+    braking: tuple[float, ...] = (2.0, 4.0)
+    offsets: tuple[float, ...] = (0.0, -0.4, 0.4)
+    lateral_time: float = 4.0
+    # weights
+    efficiency: float = 3.0
+    acceleration: float = 0.25
+    jerk: float = 0.1
+    offset: float = 0.5
+    bending: float = 40.0
+    headway: float = 4.0
+    proximity: float = 0.6
+
+    @property
+    def moments(self) -> int:
+        """Samples in time, now and the end of the horizon among them."""
+        return round(self.horizon / self.dt) + 1
+
+    def times(self) -> Float[Array, " H"]:
+        """s from now."""
+        return self.dt * jnp.arange(self.moments, dtype=jnp.float32)
+
+
+_BROKEN = 1e3  # cost of a broken bound, per unit of excess
+_TOUCH = 5e3  # cost of touching somebody at once; later ones count less, with this time constant:
+_FORGET = 2.0  # s
+_MARGIN = 0.5  # m kept ahead of and behind others
+_SIDE = 0.25  # m kept beside others
+_REACTION = 0.5  # s at the present speed before braking hard: see `_rss`
+_RSS_UNTIL = 1.5  # s; later there will be another plan
+_APPROACH = 0.6  # of the comfortable deceleration: slows down for bends, limits and lines ahead
+_MIN_LATERAL = 10.0  # m, least distance in which the offset changes
+
+
+def quartic(
+    v0: Array, a0: Array, v1: Array, end: Array | float, t: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Distance, speed, acceleration and jerk of the quartic that reaches `v1` without acceleration at `end`.
+
+    From speed `v0` and acceleration `a0`; after `end` on at that speed. SI units.
+    """
+    dv, da = v1 - v0 - a0 * end, -a0
+    a3 = (3 * dv - da * end) / (3 * end**2)
+    a4 = (-2 * dv + da * end) / (4 * end**3)
+    u = jnp.minimum(t, end)
+    s = u * (v0 + u * (a0 / 2 + u * (a3 + u * a4)))
+    on = t <= end
+    v = jnp.where(on, v0 + u * (a0 + u * (3 * a3 + u * 4 * a4)), v1)
+    a = jnp.where(on, a0 + u * (6 * a3 + u * 12 * a4), 0)
+    return s + jnp.maximum(t - end, 0) * v1, v, a, jnp.where(on, 6 * a3 + 24 * a4 * u, 0)
+
+
+def quintic(
+    x0: Array, v0: Array, a0: Array, x1: Array, v1: Array | float, a1: Array | float, end: Array, t: Array
+) -> tuple[Array, Array, Array, Array]:
+    """The quintic between two points with given derivatives, `end` apart, at `t`; and its derivatives.
+
+    After `end` it stays at `x1` if `v1` is 0.
+    """
+    d0, d1, d2 = x1 - x0 - v0 * end - a0 / 2 * end**2, v1 - v0 - a0 * end, a1 - a0
+    a3 = (10 * d0 - 4 * d1 * end + d2 / 2 * end**2) / end**3
+    a4 = (-15 * d0 + 7 * d1 * end - d2 * end**2) / end**4
+    a5 = (6 * d0 - 3 * d1 * end + d2 / 2 * end**2) / end**5
+    u = jnp.minimum(t, end)
+    on = t <= end
+    x = x0 + u * (v0 + u * (a0 / 2 + u * (a3 + u * (a4 + u * a5))))
+    v = v0 + u * (a0 + u * (3 * a3 + u * (4 * a4 + u * 5 * a5)))
+    a = a0 + u * (6 * a3 + u * (12 * a4 + u * 20 * a5))
+    j = 6 * a3 + u * (24 * a4 + u * 60 * a5)
+    return x, jnp.where(on, v, v1), jnp.where(on, a, 0), jnp.where(on, j, 0)
+
+
+def speed_envelope(task: Task) -> Float[Array, "V M"]:
+    """Fastest speed at every point of the way, m/s, from which all that comes is met by braking mildly.
+
+    Speed limits, bends and the wall.
+    """
+    way, driver = task.way, task.driver
+    fastest = jnp.minimum(driver.speed_factor[:, None] * way.limit, driver.v_max[:, None])
+    bend = jnp.sqrt(driver.a_lat[:, None] / jnp.maximum(jnp.abs(way.curvature), 1e-5))
+    top = jnp.minimum(fastest, bend)
+    b = 2 * _APPROACH * driver.b[:, None]
+    at = way.step * jnp.arange(way.x.shape[-1], dtype=top.dtype)[None]
+    square = lax.cummin(top * top + b * at, axis=1, reverse=True) - b * at
+    room = jnp.maximum(task.wall[:, None] - at, 0)
+    return jnp.sqrt(jnp.maximum(jnp.minimum(square, b * room), 0))
+
+
+def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
+    """All samples of the lattice for every vehicle, with their costs."""
+    envelope = speed_envelope(task)
+    s, v, a, jerk = _along(lattice, model, task, envelope)  # [V A H]
+    offsets = jnp.asarray(lattice.offsets, s.dtype)
+    count, along, moments = s.shape
+    across = offsets.shape[0]
+
+    def wide(x: Array) -> Array:
+        return jnp.broadcast_to(x[:, :, None], (count, along, across, moments)).reshape(count, -1, moments)
+
+    s, v, a, jerk = wide(s), wide(v), wide(a), wide(jerk)
+    start = task.start
+    end = jnp.maximum(start.v * lattice.lateral_time, _MIN_LATERAL + 4 * jnp.abs(start.d))
+    goal = jnp.tile(offsets, along)
+    each = lambda x: x[:, None, None]  # noqa: E731
+    d, slope, bend, _ = quintic(
+        each(start.d), each(start.slope), each(start.bend), goal[None, :, None], 0.0, 0.0, each(end), s
+    )
+    place = place_on(task.way, s, d)
+    stretch = jnp.maximum(1 - place.curvature * d, 0.2)
+    skew = slope / stretch
+    turned = lax.rsqrt(1 + skew * skew)  # cosine of the angle to the way
+    heading = place.heading + jnp.arctan(skew)
+    curvature = ((bend + place.curvature * slope * skew) * turned**2 / stretch + place.curvature) * (
+        turned / stretch
+    )
+    speed = v * stretch / turned
+    cost, broken = _costs(
+        lattice, task, envelope, s, d, place.x, place.y, heading, speed, v, a, jerk, curvature, bend
+    )
+    return Samples(s, d, place.x, place.y, heading, speed, curvature, cost, broken)
+
+
+def plan(lattice: Lattice, model: CarFollowing, task: Task) -> Plan:
+    """The cheapest sample for every vehicle."""
+    samples = sample(lattice, model, task)
+    total = samples.cost + _BROKEN * samples.broken
+    best = jnp.argmin(total, -1)
+
+    def pick(x: Array) -> Array:
+        index = best.reshape(best.shape + (1,) * (x.ndim - 1))
+        return jnp.take_along_axis(x, index, 1)[:, 0]
+
+    return Plan(
+        *(pick(x) for x in (samples.x, samples.y, samples.heading, samples.v)),
+        cost=pick(total),
+        sample=best.astype(jnp.int32),
+        safe=pick(samples.broken) == 0,
+    )
+
+
+def _along(
+    lattice: Lattice, model: CarFollowing, task: Task, envelope: Float[Array, "V M"]
+) -> tuple[Array, Array, Array, Array]:
+    """Motion along the way `[V A H]`: m, m/s, m/s^2, m/s^3."""
+    start, t = task.start, lattice.times()[None, None]
+    v0, a0 = start.v[:, None, None], jnp.clip(start.a, -8.0, 4.0)[:, None, None]
+    # end speeds from a standstill to the fastest that is allowed where it would be then
+    top = jnp.maximum(jnp.max(envelope[:, : max(2, int(30 / task.way.step))], -1), start.v)
+    share = jnp.linspace(0.0, 1.0, lattice.speeds)
+    parts = []
+    for end in lattice.horizons:
+        reach = jnp.minimum(top, start.v + 1.5 * end)[:, None]
+        low = jnp.maximum(start.v - 3.0 * end, 0)[:, None]
+        parts.append(quartic(v0, a0, (low + share[None] * (reach - low))[:, :, None], end, t))
+    parts.append(quartic(v0, a0, v0, 2.0, t))
+    # stops at the wall
+    distance = jnp.maximum(task.wall, 0.05)[:, None, None]
+    stop = jnp.asarray(lattice.stops, v0.dtype)[None, :, None] * 2 * distance / jnp.maximum(v0, 0.5)
+    parts.append(quintic(jnp.zeros_like(v0), v0, a0, distance, 0.0, 0.0, jnp.clip(stop, 1.0, 15.0), t))
+    # braking
+    hard = [jnp.full_like(start.v, b) for b in lattice.braking] + [task.driver.b_max]
+    b = jnp.stack(hard, -1)[:, :, None]
+    u = jnp.minimum(t, v0 / b)
+    v = v0 - b * u
+    parts.append((u * (v0 - b * u / 2), v, jnp.where(v > 0, -b, 0), jnp.zeros_like(v)))
+    parts.append(_follow(lattice, model, task, envelope))
+    shape = (*start.v.shape, -1, lattice.moments)
+    s, v, a, jerk = (
+        jnp.concatenate(
+            [jnp.broadcast_to(part[k], (shape[0], part[0].shape[1], shape[2])) for part in parts], 1
+        )
+        for k in range(4)
+    )
+    return lax.cummax(s, axis=2), jnp.maximum(v, 0), a, jerk
+
+
+def _follow(
+    lattice: Lattice, model: CarFollowing, task: Task, envelope: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Car following behind all leaders and before the wall, with several shares of the desired speed."""
+    start, way, dt = task.start, task.way, lattice.dt
+    driver = jax.tree.map(lambda x: x[:, None, None], task.driver)
+    share = jnp.asarray(lattice.following, start.v.dtype)[None]
+    v = jnp.broadcast_to(start.v[:, None], (start.v.shape[0], share.shape[1]))
+    none = jnp.zeros_like(v)
+    wall = (task.wall + task.driver.s0)[:, None, None]
+    far = jnp.concatenate([task.lead_gap[:, None], wall], -1)
+    lead_v = jnp.concatenate([task.lead_v[:, None], jnp.zeros_like(wall)], -1)
+    is_lead = far < NO_GAP / 2  # [V 1 J]
+
+    def step(carry: tuple[Array, ...], t: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        s, v, a = carry
+        k = jnp.clip((s / way.step).astype(jnp.int32), 0, way.x.shape[-1] - 1)
+        v0 = share * jnp.take_along_axis(envelope, k, 1)
+        gap = jnp.where(is_lead, far + lead_v * t - s[..., None], NO_GAP)
+        ahead = jnp.where(is_lead, lead_v, v[..., None])
+        wish = model(
+            driver, gap=gap, v=v[..., None], v_lead=ahead, a_lead=jnp.zeros_like(gap), v0=v0[..., None]
+        ).min(-1)
+        wish = jnp.clip(wish, a - 6.0 * dt, a + 3.0 * dt)  # the drive train follows no steps
+        new = jnp.maximum(v + wish * dt, 0)
+        return (s + (v + new) / 2 * dt, new, wish), (s, v, wish, (wish - a) / dt)
+
+    a = jnp.broadcast_to(jnp.clip(start.a, -8.0, 4.0)[:, None], v.shape)
+    _, found = lax.scan(step, (none, v, a), lattice.times())
+    s, v, a, jerk = (jnp.moveaxis(x, 0, -1) for x in found)
+    return s, v, a, jerk
+
+
+def _costs(
+    lattice: Lattice,
+    task: Task,
+    envelope: Array,
+    s: Array,
+    d: Array,
+    x: Array,
+    y: Array,
+    heading: Array,
+    speed: Array,
+    v: Array,
+    a: Array,
+    jerk: Array,
+    curvature: Array,
+    bend: Array,
+) -> tuple[Float[Array, "V S"], Float[Array, "V S"]]:
+    """Cost of every sample, and by how much it breaks bounds."""
+    way, driver, t = task.way, task.driver, lattice.times()[None, None]
+    each = lambda value: value[:, None, None]  # noqa: E731
+    flat = (s.shape[0], -1)
+    u = s.reshape(flat) / way.step
+    k = jnp.clip(u.astype(jnp.int32), 0, way.x.shape[-1] - 2)
+
+    def along(table: Float[Array, "V M"]) -> Array:
+        low, high = jnp.take_along_axis(table, k, 1), jnp.take_along_axis(table, k + 1, 1)
+        return (low + jnp.clip(u - k.astype(u.dtype), 0, 1) * (high - low)).reshape(s.shape)
+
+    allowed = along(envelope)
+    desired = jnp.maximum(envelope[:, :1, None], 5.0)
+    slow = jnp.maximum(allowed - v, 0) / desired
+    gap = jnp.minimum(
+        task.lead_gap[:, None, None] + task.lead_v[:, None, None] * t[..., None] - s[..., None],
+        NO_GAP,
+    )  # [V S H J]
+    # the gap that IDM wants, which grows with the speed at which one comes nearer
+    approach = v[..., None] - task.lead_v[:, None, None]
+    dynamic = each(driver.T)[..., None] + approach / (2 * jnp.sqrt(each(driver.a * driver.b)))[..., None]
+    wanted = each(driver.s0)[..., None] + jnp.maximum(v[..., None] * dynamic, 0)
+    close = jnp.maximum(1 - gap / wanted, 0).max(-1)
+    cost = (
+        lattice.efficiency * jnp.mean(slow * slow, -1)
+        + lattice.acceleration * jnp.mean(a * a, -1)
+        + lattice.jerk * jnp.mean(jerk * jerk, -1)
+        + lattice.offset * jnp.mean(d * d, -1)
+        + lattice.bending * jnp.mean((bend * speed) ** 2, -1) / 25
+        + lattice.headway * jnp.mean(close * close, -1)
+    )
+
+    # bounds
+    over = jnp.maximum(v - allowed - 0.5, 0)
+    beyond = jnp.maximum(s - jnp.maximum(each(task.wall), 0) - 0.3, 0)
+    b_ego, b_lead = each(jnp.minimum(driver.b_max, 7.0)), 8.0
+    lead_v = task.lead_v[:, None, None]
+    need = (v * _REACTION + v * v / (2 * b_ego) + 1.0)[..., None] - lead_v**2 / (2 * b_lead)
+    rss = jnp.where(t <= _RSS_UNTIL, jnp.maximum(jnp.maximum(need, 0.5) - gap, 0).max(-1), 0)
+    tight = jnp.maximum(jnp.abs(curvature) - each(jnp.tan(task.steering) / task.wheelbase), 0)
+    lateral = jnp.maximum(jnp.abs(curvature) * speed * speed - each(driver.a_lat) - 1.0, 0)
+    half = each(task.width) / 2
+    left, right = along(way.left), along(way.right)
+    edge = jnp.maximum(jnp.maximum(d + half - left, -d + half - right), 0)
+    edge = jnp.maximum(edge - jnp.maximum(edge[..., :1], 0.05), 0)  # who is out there already may come back
+    acceleration = jnp.maximum(a - 4.0, 0) + jnp.maximum(-a - each(driver.b_max) - 0.5, 0)
+    broken = (
+        0.02 * jnp.mean(over * over, -1)
+        + 0.5 * jnp.max(beyond, -1)
+        + 0.1 * jnp.max(rss, -1)
+        + 10 * jnp.max(tight, -1)
+        + 0.1 * jnp.max(lateral, -1)
+        + jnp.max(edge, -1)
+        + jnp.max(acceleration, -1)
+    )
+    touch, near = _meet(lattice, task, x, y, heading)
+    fade = jnp.exp(-t / _FORGET)
+    broken = broken + _TOUCH / _BROKEN * jnp.max(touch * fade, -1) + jnp.sum(touch * fade, -1) * 0.2
+    return cost + lattice.proximity * jnp.mean(near, -1), broken
+
+
+def _meet(
+    lattice: Lattice, task: Task, x: Array, y: Array, heading: Array
+) -> tuple[Float[Array, "V S H"], Float[Array, "V S H"]]:
+    """Whether others are touched, 0 or 1, and how near they come beside, 0 to 1.
+
+    The other's box as seen along our axes, with room around: at most a little too large.
+    """
+    other = task.other
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
+    half_length, half_width = task.length[:, None, None] / 2, task.width[:, None, None] / 2
+    touch, near = jnp.zeros_like(x), jnp.zeros_like(x)
+    for k in range(other.x.shape[1]):
+        dx, dy = other.x[:, k, None] - x, other.y[:, k, None] - y
+        turned = other.heading[:, k, None] - heading
+        c, s = jnp.abs(jnp.cos(turned)), jnp.abs(jnp.sin(turned))
+        its_length, its_width = other.length[:, k, None, None] / 2, other.width[:, k, None, None] / 2
+        ahead = jnp.abs(dx * cos + dy * sin) - half_length - c * its_length - s * its_width
+        aside = jnp.abs(-dx * sin + dy * cos) - half_width - s * its_length - c * its_width
+        counts = other.counts[:, k, None, None]
+        hit = (ahead < _MARGIN) & (aside < _SIDE) & counts
+        touch = jnp.maximum(touch, hit.astype(x.dtype))
+        beside = jnp.clip(1 - aside, 0, 1)
+        near = jnp.maximum(near, jnp.where(counts & (ahead < _MARGIN), beside, 0))
+    return touch, near

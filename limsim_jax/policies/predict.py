@@ -1,0 +1,316 @@
+"""Where others will be: predictions of all vehicles as arrays, for planners to keep clear of.
+
+A `Predictor` is a function; a planner takes any. Two are here: `constant_velocity` along the route, and
+`straight` along the heading, as in PDM (Dauner et al., CoRL 2023). `hypotheses` has several futures of a
+vehicle where lanes split. Without gradient through which lane a vehicle is on.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s
+from limsim_jax.numerics import computed_once, safe_divide
+from limsim_jax.traffic.collision import CLEARANCE, level
+from limsim_jax.traffic.ego import is_free
+from limsim_jax.traffic.motion import CREEP_SPEED, boxes, smooth_step
+from limsim_jax.types import State
+
+SETTLE = 3.0
+"""s in which the offset of a vehicle that changes no lanes fades to the middle of its lane."""
+
+STOPPING = 2.0
+"""m/s^2, braking before a place to stop, or what it takes if that is more."""
+
+_LANES = 4  # lanes beyond the own one that are looked at
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """Where the bodies of `N` vehicles are expected at `H` moments."""
+
+    x: Float[Array, "N H"]  # m, centre of the body
+    y: Float[Array, "N H"]
+    heading: Float[Array, "N H"]  # rad
+    length: Float[Array, " N"]  # m
+    width: Float[Array, " N"]
+    times: Float[Array, " H"]  # s from now
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Hypotheses:
+    """Several predictions of each vehicle, `M`, and how likely they are."""
+
+    x: Float[Array, "N M H"]  # m, centre of the body
+    y: Float[Array, "N M H"]
+    heading: Float[Array, "N M H"]  # rad
+    weight: Float[Array, "N M"]  # sums to 1; 0 where there are fewer
+    length: Float[Array, " N"]  # m
+    width: Float[Array, " N"]
+    times: Float[Array, " H"]  # s from now
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Plans:
+    """What planned vehicles let others know: where `V` of them will be at the times of a prediction."""
+
+    slot: Int[Array, " V"]  # -1: nobody's plan
+    x: Float[Array, "V H"]  # m, centre of the body
+    y: Float[Array, "V H"]
+    heading: Float[Array, "V H"]  # rad
+
+
+class Predictor(Protocol):
+    """Written for one world."""
+
+    def __call__(
+        self,
+        lane_map: LaneMap,
+        state: State,
+        times: Float[Array, " H"],
+        *,
+        stop: Float[Array, " N"] | None = None,
+        plans: Plans | None = None,
+    ) -> Prediction:
+        """Where all vehicles will be `times` s from now.
+
+        `stop`: m ahead of each front bumper beyond which the vehicle will not go; `plans` override.
+        """
+        ...
+
+
+@jax.named_scope("predict")
+def constant_velocity(
+    lane_map: LaneMap,
+    state: State,
+    times: Float[Array, " H"],
+    *,
+    stop: Float[Array, " N"] | None = None,
+    plans: Plans | None = None,
+) -> Prediction:
+    """Everybody goes on along its route at its speed; lane changes in progress finish.
+
+    Off the middle of its lane a vehicle returns there within `SETTLE` s. Before a place to `stop` it brakes
+    with `STOPPING`, or what it takes. Routes of more than five lanes within the times end straight on.
+    """
+    start = _start(lane_map, state)
+    rows, begins = _route(lane_map, state, start.lane)
+    x, y, heading = _along(lane_map, state, start, rows, begins, times, stop)
+    shape = state.shape
+    prediction = Prediction(x=x, y=y, heading=heading, length=shape.length, width=shape.width, times=times)
+    return _with(prediction, plans)
+
+
+@jax.named_scope("predict")
+def straight(
+    lane_map: LaneMap,
+    state: State,
+    times: Float[Array, " H"],
+    *,
+    stop: Float[Array, " N"] | None = None,
+    plans: Plans | None = None,
+) -> Prediction:
+    """Everybody goes straight on at its speed. `stop` as in `constant_velocity`."""
+    box = boxes(lane_map, state)
+    way, _ = _travelled(state, times, stop)
+    heading = jnp.broadcast_to(box[:, 2:3], way.shape)
+    prediction = Prediction(
+        x=box[:, 0:1] + way * jnp.cos(heading),
+        y=box[:, 1:2] + way * jnp.sin(heading),
+        heading=heading,
+        length=box[:, 3],
+        width=box[:, 4],
+        times=times,
+    )
+    return _with(prediction, plans)
+
+
+@jax.named_scope("hypotheses")
+def hypotheses(
+    lane_map: LaneMap,
+    state: State,
+    times: Float[Array, " H"],
+    *,
+    modes: int = 3,
+    known: float | None = None,
+    stop: Float[Array, " N"] | None = None,
+) -> Hypotheses:
+    """What everybody may do at the next split of lanes: one prediction per successor there.
+
+    Beyond the split a vehicle that leaves its route takes the first successor of each lane.
+
+    Args:
+      lane_map: where.
+      state: the world now.
+      times: s from now.
+      modes: `M`; successors beyond that many are left out.
+      known: probability of the way that the route takes, and the rest in equal shares; None: nobody knows
+        the route, so all successors are equally likely.
+      stop: as in `constant_velocity`, for all of them.
+    """
+    if known is not None and not 0 <= known <= 1:
+        raise ValueError(f"known: a probability of {known}; it must be within 0 and 1")
+    start = _start(lane_map, state)
+    route, _ = _route(lane_map, state, start.lane)
+    count = (lane_map.successors != NO_LANE).sum(-1)
+    # the lane before the split, as a place in the route
+    splits = (count[route] > 1) & (route != NO_LANE)
+    split = jnp.where(splits.any(-1), jnp.argmax(splits, -1), route.shape[-1])
+    before = jnp.take_along_axis(route, jnp.minimum(split, route.shape[-1] - 1)[:, None], -1)[:, 0]
+    exists = [split < route.shape[-1]]
+    found, weights = [], []
+    taken = route[:, 1:]
+    for mode in range(modes):
+        branch = lane_map.successors[before, mode] if mode < lane_map.successors.shape[1] else before * 0 - 1
+        there = exists[0] & (branch != NO_LANE)
+        rows, begins = [start.lane], [-start.s]
+        on_route = jnp.ones_like(there)
+        for k in range(_LANES):
+            at_split = there & (split == k)
+            after = jnp.where(on_route, taken[:, k], lane_map.successors[rows[-1], 0])
+            after = jnp.where(at_split, branch, after)
+            on_route &= after == taken[:, k]
+            begins.append(jnp.where(after == NO_LANE, 1e9, begins[-1] + lane_map.length[rows[-1]]))
+            rows.append(after)
+        ahead = jnp.stack(rows, -1), jnp.stack(begins, -1)
+        found.append(_along(lane_map, state, start, *ahead, times, stop))
+        share = safe_divide(jnp.ones_like(state.v), jnp.minimum(count[before], modes).astype(state.v.dtype))
+        if known is not None:
+            mine = (jnp.take_along_axis(taken, jnp.minimum(split, _LANES - 1)[:, None], -1)[:, 0]) == branch
+            rest = jnp.maximum(jnp.minimum(count[before], modes) - 1, 1).astype(state.v.dtype)
+            share = jnp.where(mine, known, (1 - known) / rest)
+        weights.append(jnp.where(there, share, jnp.where(exists[0] | (mode > 0), 0.0, 1.0)))
+    weight = jnp.stack(weights, -1)
+    weight = safe_divide(weight, jnp.broadcast_to(weight.sum(-1, keepdims=True), weight.shape))
+    x, y, heading = (jnp.stack(values, 1) for values in zip(*found, strict=True))
+    shape = state.shape
+    return Hypotheses(
+        x=x, y=y, heading=heading, weight=weight, length=shape.length, width=shape.width, times=times
+    )
+
+
+def nearest(
+    lane_map: LaneMap, state: State, prediction: Prediction, slot: Int[Array, " V"], k: int
+) -> Int[Array, "V K"]:
+    """Slots of the `k` others that come nearest to each of these vehicles, -1 where there are fewer.
+
+    By the least distance of the predicted centres at one of the times less what the bodies reach. Vehicles
+    of another level (bridges) and inactive ones do not count.
+    """
+    n = state.active.shape[0]
+    apart = (prediction.x[slot][:, None] - prediction.x[None]) ** 2
+    apart = jnp.sqrt(jnp.min(apart + (prediction.y[slot][:, None] - prediction.y[None]) ** 2, -1))
+    apart = apart - prediction.length[None] / 2
+    z = level(lane_map, state)
+    counts = state.active[None] & (jnp.abs(z[slot][:, None] - z[None]) <= CLEARANCE)
+    counts &= (jnp.arange(n)[None] != slot[:, None]) & (slot[:, None] >= 0)
+    apart = computed_once(jnp.where(counts, apart, jnp.inf))
+    least, which = lax.top_k(-apart, min(k, n))
+    found = jnp.where(jnp.isfinite(least), which.astype(slot.dtype), -1)
+    return jnp.pad(found, ((0, 0), (0, k - min(k, n))), constant_values=-1)
+
+
+# --- parts -------------------------------------------------------------------------------------------
+
+
+class _Start(NamedTuple):
+    """Where everybody is on the lane that it is on, or changes to."""
+
+    lane: Int[Array, " N"]
+    s: Float[Array, " N"]  # m, centre of the body; negative on the lane before
+    changes: Array
+
+
+def _start(lane_map: LaneMap, state: State) -> _Start:
+    changes = (state.side != 0) & ~is_free(state)
+    beside = jnp.where(state.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
+    over = changes & ~state.crossed & (beside != NO_LANE)
+    s = jnp.where(over, side_s(lane_map, state.lane, state.s, state.side), state.s)
+    return _Start(jnp.where(over, beside, state.lane), s - state.shape.length / 2, changes)
+
+
+def _route(lane_map: LaneMap, state: State, lane: Int[Array, " N"]) -> tuple[Array, Array]:
+    """The lanes from this one on along the routes, and where they begin, m from its start `[N D]`."""
+    rows = [lane]
+    begins = [jnp.zeros_like(state.s)]
+    for _ in range(_LANES):
+        after = lane_map.routes.next_lane[rows[-1], state.goal]
+        begins.append(jnp.where(after == NO_LANE, 1e9, begins[-1] + lane_map.length[rows[-1]]))
+        rows.append(after)
+    return jnp.stack(rows, -1), jnp.stack(begins, -1)
+
+
+def _travelled(
+    state: State, times: Float[Array, " H"], stop: Float[Array, " N"] | None
+) -> tuple[Float[Array, "N H"], Float[Array, "N H"]]:
+    """m that everybody has travelled by then, and the speed, m/s."""
+    v, t = state.v[:, None], times[None, :]
+    if stop is None:
+        return v * t, jnp.broadcast_to(v, (v.shape[0], times.shape[0]))
+    room = jnp.maximum(stop, 0)[:, None]
+    b = jnp.maximum(STOPPING, v * v / jnp.maximum(2 * room, 0.1))
+    begin = jnp.maximum(room - v * v / (2 * b), 0) / jnp.maximum(v, 1e-3)  # s from now
+    braking = jnp.clip(t - begin, 0, v / b)
+    way = v * jnp.minimum(t, begin) + v * braking - b * braking * braking / 2
+    return jnp.minimum(way, room), v - b * braking
+
+
+def _along(
+    lane_map: LaneMap,
+    state: State,
+    start: _Start,
+    rows: Int[Array, "N D"],
+    begins: Float[Array, "N D"],
+    times: Float[Array, " H"],
+    stop: Float[Array, " N"] | None,
+) -> tuple[Float[Array, "N H"], Float[Array, "N H"], Float[Array, "N H"]]:
+    way, v = _travelled(state, times, stop)
+    at = start.s[:, None] + way
+    # lanes of the route count from the start of the first one; before it lies the one it came from
+    begins = begins - begins[:, :1]
+    which = jnp.maximum(jnp.sum(begins[:, None, :] <= at[:, :, None], -1) - 1, 0)
+    lane = jnp.take_along_axis(rows, which, -1)
+    s = at - jnp.take_along_axis(begins, which, -1)
+    moved = start.lane != state.lane
+    came = jnp.where(state.side > 0, lane_map.left[state.previous], lane_map.right[state.previous])
+    came = jnp.where(moved, came, state.previous)[:, None]
+    behind = (s < 0) & (came != NO_LANE)
+    lane, s = jnp.where(behind, came, lane), jnp.where(behind, s + lane_map.length[came], s)
+
+    # lane changes go on by the clock; what else is off the middle fades
+    rate = safe_divide(jnp.minimum(state.v / CREEP_SPEED, 1), state.driver.lane_change_time)
+    changes = start.changes[:, None]
+    u = jnp.where(changes, state.progress[:, None], 0)
+    pace = jnp.where(changes, rate[:, None], jnp.minimum(state.v / CREEP_SPEED, 1)[:, None] / SETTLE)
+    u = jnp.clip(u + pace * times[None], 0, 1)
+    offset = jnp.where(start.changes, state.shift, state.d)[:, None]
+    d = offset * (1 - smooth_step(u))
+    across = -offset * 30 * u * u * (1 - u) * (1 - u) * pace
+    x, y, heading = pose(lane_map, lane, s, d)
+    return x, y, heading + jnp.arctan(jnp.clip(across / jnp.maximum(v, 0.5), -0.2, 0.2))
+
+
+def _with(prediction: Prediction, plans: Plans | None) -> Prediction:
+    """The prediction, where somebody's plan is known that plan."""
+    if plans is None or plans.slot.shape[0] == 0:
+        return prediction
+    mine = plans.slot[:, None] == jnp.arange(prediction.x.shape[0], dtype=plans.slot.dtype)[None, :]
+    planned, whose = mine.any(0)[:, None], jnp.argmax(mine, 0)
+
+    def put(old: Array, new: Array) -> Array:
+        return jnp.where(planned, new[whose], old)
+
+    return Prediction(
+        x=put(prediction.x, plans.x),
+        y=put(prediction.y, plans.y),
+        heading=put(prediction.heading, plans.heading),
+        length=prediction.length,
+        width=prediction.width,
+        times=prediction.times,
+    )

@@ -1,0 +1,217 @@
+"""The way ahead of vehicles as a row of points, and places on it: what planners plan along.
+
+A `Way` begins where the centre of the body is (arc length 0) and follows the route of the vehicle along
+the middle of its lanes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from limsim_jax.geometry import wrap_angle
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, pose, side_s, width
+from limsim_jax.traffic.ego import body_place
+from limsim_jax.traffic.motion import lateral_speed
+from limsim_jax.types import State
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Way:
+    """Ways of `V` vehicles: `M` points each, `step` m apart along the lanes of their routes."""
+
+    x: Float[Array, "V M"]  # m
+    y: Float[Array, "V M"]
+    heading: Float[Array, "V M"]  # rad, without jumps along the way
+    curvature: Float[Array, "V M"]  # 1/m
+    limit: Float[Array, "V M"]  # m/s, speed limit
+    left: Float[Array, "V M"]  # m from the middle of the lane to the edge of the roadway, both > 0
+    right: Float[Array, "V M"]
+    lane: Int[Array, "V M"]
+    end: Float[Array, " V"]  # m to where the route leaves these lanes; beyond it a way goes straight on
+    step: float = struct.field(pytree_node=False)
+
+    @property
+    def reach(self) -> float:
+        """m from the first point to the last."""
+        return self.step * (self.x.shape[-1] - 1)
+
+
+class Frenet(NamedTuple):
+    """Motion along and across a way, at its first point."""
+
+    s: Float[Array, " V"]  # m
+    v: Float[Array, " V"]  # m/s along
+    a: Float[Array, " V"]  # m/s^2
+    d: Float[Array, " V"]  # m, left > 0
+    d_v: Float[Array, " V"]  # m/s across
+    d_a: Float[Array, " V"]  # m/s^2
+    slope: Float[Array, " V"]  # m/m, of d over s
+    bend: Float[Array, " V"]  # 1/m, second derivative of d over s
+
+
+def way_ahead(
+    lane_map: LaneMap,
+    lane: Int[Array, " V"],
+    s: Float[Array, " V"],
+    goal: Int[Array, " V"],
+    *,
+    points: int,
+    step: float,
+    lanes: int = 5,
+    after: Int[Array, " V"] | None = None,
+) -> Way:
+    """Ways from `s` (m) on `lane` along the route to `goal`.
+
+    Args:
+      lane_map: where.
+      lane: rows of the lane map; NO_LANE gives a harmless way.
+      s: arc length of the first point.
+      goal: columns of the route table.
+      points: of each way.
+      step: m between points.
+      lanes: lanes beyond the first that are looked at; the last one goes straight on at its end.
+      after: lane after the first one, where known: the front is on it already; else NO_LANE.
+    """
+    routes = lane_map.routes
+    ids, starts, end = [lane], [-s], jnp.full_like(s, 1e6)
+    for _ in range(lanes):
+        start = starts[-1] + lane_map.length[ids[-1]]
+        following = routes.next_lane[ids[-1], goal]
+        if after is not None and len(ids) == 1:
+            following = jnp.where(after == NO_LANE, following, after)
+        end = jnp.where(following == NO_LANE, jnp.minimum(end, start), end)
+        ids.append(following)
+        starts.append(jnp.where(following == NO_LANE, 1e9, start))
+    rows, begins = jnp.stack(ids, -1), jnp.stack(starts, -1)  # [V D]
+    at = step * jnp.arange(points, dtype=s.dtype)
+    which = jnp.sum(begins[:, None, :] <= at[None, :, None], -1) - 1  # [V M]
+    which = jnp.maximum(which, 0)
+    here = jnp.take_along_axis(rows, which, -1)
+    there = at[None] - jnp.take_along_axis(begins, which, -1)
+    x, y, heading = pose(lane_map, here, there)
+    turn = wrap_angle(jnp.diff(heading, axis=-1))
+    heading = jnp.concatenate([heading[:, :1], heading[:, :1] + jnp.cumsum(turn, -1)], -1)
+    half = width(lane_map, here, there) / 2
+
+    def beside(side: int) -> Float[Array, "V M"]:
+        other = (lane_map.left if side > 0 else lane_map.right)[here]
+        place = side_s(lane_map, here, there, jnp.full_like(here, side))
+        return half + jnp.where(other == NO_LANE, 0, width(lane_map, other, place))
+
+    inside = there <= lane_map.length[here]
+    return Way(
+        x=x,
+        y=y,
+        heading=heading,
+        curvature=jnp.where(inside, curvature(lane_map, here, there), 0),
+        limit=lane_map.speed_limit[here],
+        left=beside(1),
+        right=beside(-1),
+        lane=here,
+        end=end,
+        step=step,
+    )
+
+
+def body_lane(lane_map: LaneMap, state: State, slot: Int[Array, " V"]) -> tuple[Array, Array]:
+    """Lane and arc length (m) of the centres of the bodies in these slots."""
+    return body_place(
+        lane_map, state.lane[slot], state.previous[slot], state.s[slot], state.shape.length[slot]
+    )
+
+
+def beside(
+    lane_map: LaneMap,
+    lane: Int[Array, " V"],
+    s: Float[Array, " V"],
+    d: Float[Array, " V"],
+    side: Int[Array, " V"],
+) -> tuple[Int[Array, " V"], Float[Array, " V"], Float[Array, " V"], Bool[Array, " V"]]:
+    """A place as seen from the lane to the left (`side` 1) or right (-1): lane, s, d, and if there is one.
+
+    Without such a lane, or with `side` 0, the place stays as it is.
+    """
+    other = jnp.where(side > 0, lane_map.left[lane], lane_map.right[lane])
+    there = (side != 0) & (other != NO_LANE)
+    other_s = side_s(lane_map, lane, s, side)
+    between = (width(lane_map, lane, s) + width(lane_map, other, other_s)) / 2
+    return (
+        jnp.where(there, other, lane),
+        jnp.where(there, other_s, s),
+        jnp.where(there, d - side * between, d),
+        there,
+    )
+
+
+def motion_on(way: Way, state: State, slot: Int[Array, " V"], d: Float[Array, " V"]) -> Frenet:
+    """How the vehicles in these slots move along and across their ways, `d` m off their first points.
+
+    Free egos by their heading in the plane, the others by the progress of their lane change.
+    """
+    v, a, egos = state.v[slot], state.a[slot], state.egos
+    astray, steered = jnp.zeros_like(v), way.curvature[:, 0]
+    free = jnp.zeros(slot.shape, bool)
+    if egos.slot.shape[0]:
+        mine = (egos.slot[None, :] == slot[:, None]) & egos.free[None, :]  # [V E]
+        free, pick = mine.any(-1), jnp.argmax(mine, -1)
+        slip = jnp.arctan(jnp.tan(egos.steering[pick]) / 2)
+        off = wrap_angle(egos.heading[pick] + slip - way.heading[:, 0])
+        astray = jnp.where(free, jnp.clip(off, -1.0, 1.0), astray)
+        turned = jnp.sin(slip) * 2 / state.shape.wheelbase[slot]
+        steered = jnp.where(free, turned, steered)
+        a = jnp.where(free, egos.a[pick], a)
+    stretch = jnp.maximum(1 - way.curvature[:, 0] * d, 0.2)
+    slope = jnp.where(free, jnp.tan(astray), lateral_speed(state)[slot] / jnp.maximum(v, 0.5)) * stretch
+    bend = steered - way.curvature[:, 0]
+    along = v * jnp.cos(astray) / stretch
+    return Frenet(
+        s=jnp.zeros_like(v), v=along, a=a, d=d, d_v=slope * along, d_a=bend * along * along,
+        slope=slope, bend=bend,
+    )  # fmt: skip
+
+
+class Place(NamedTuple):
+    """The plane at places on a way; shapes as those of the places."""
+
+    x: Float[Array, ...]  # m
+    y: Float[Array, "*b"]
+    heading: Float[Array, ...]  # rad, of the way
+    curvature: Float[Array, ...]  # 1/m, of the way
+
+
+def place_on(way: Way, s: Float[Array, "V ..."], d: Float[Array, "V ..."]) -> Place:
+    """Cartesian place `s` m along and `d` m left of each way: a cubic Hermite curve between its points.
+
+    Beyond its last point a way goes straight on, before its first one straight back.
+    """
+    flat = (s.shape[0], -1)
+    s_, d_ = s.reshape(flat), jnp.broadcast_to(d, s.shape).reshape(flat)
+    last = way.x.shape[-1] - 2
+    u = s_ / way.step
+    k = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, last)
+    u = u - k.astype(u.dtype)
+    inside = jnp.clip(u, 0, 1)
+    rest = (u - inside) * way.step
+
+    def at(table: Float[Array, "V M"], n: int) -> Array:
+        return jnp.take_along_axis(table, k + n, -1)
+
+    x0, x1, y0, y1 = at(way.x, 0), at(way.x, 1), at(way.y, 0), at(way.y, 1)
+    h0, h1, c0, c1 = at(way.heading, 0), at(way.heading, 1), at(way.curvature, 0), at(way.curvature, 1)
+    h = way.step
+    cos0, sin0, cos1, sin1 = jnp.cos(h0), jnp.sin(h0), jnp.cos(h1), jnp.sin(h1)
+    t2 = inside * inside
+    t3 = t2 * inside
+    b1, b2, b3 = 3 * t2 - 2 * t3, inside - 2 * t2 + t3, t3 - t2
+    x = x0 + b1 * (x1 - x0) + h * (b2 * cos0 + b3 * cos1)
+    y = y0 + b1 * (y1 - y0) + h * (b2 * sin0 + b3 * sin1)
+    heading = h0 + inside * (h1 - h0)
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
+    x = x + rest * cos - d_ * sin
+    y = y + rest * sin + d_ * cos
+    bend = jnp.where(rest == 0, c0 + inside * (c1 - c0), 0)
+    return Place(*(value.reshape(s.shape) for value in (x, y, heading, bend)))

@@ -1,0 +1,210 @@
+"""Trajectories of LimSim-TM: boundary conditions, bounds, and what is seen ahead."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import BPoly
+from traffic_worlds import drivers
+
+from limsim_jax.policies.limsim_tm.plan import (
+    Lattice,
+    Others,
+    Task,
+    plan,
+    quartic,
+    quintic,
+    sample,
+    speed_envelope,
+)
+from limsim_jax.policies.reference import Frenet, Way
+from limsim_jax.traffic.car_following import ACC, NO_GAP
+
+POINTS, STEP = 80, 2.0
+LATTICE = Lattice()
+K = 3
+
+
+def way(bends, limit=15.0):
+    """Arcs of one curvature each, from the origin to the east; roadways of unequal sides."""
+    at = STEP * np.arange(POINTS)
+    rows = {name: [] for name in ("x", "y", "heading", "curvature")}
+    for bend in bends:
+        turn = bend * at
+        near = abs(bend) < 1e-9
+        rows["x"].append(at if near else np.sin(turn) / bend)
+        rows["y"].append(0 * at if near else (1 - np.cos(turn)) / bend)
+        rows["heading"].append(turn)
+        rows["curvature"].append(0 * at + bend)
+    full = np.ones((len(bends), POINTS))
+    fields = {name: np.array(row) for name, row in rows.items()}
+    fields |= {"limit": full * limit, "left": full * 5.0, "right": full * 1.9, "lane": full.astype(np.int32)}
+    fields = {name: jnp.asarray(x, None if name == "lane" else jnp.float32) for name, x in fields.items()}
+    return Way(**fields, end=jnp.full(len(bends), 1e6), step=STEP)
+
+
+def task(
+    bends=(0.0,), v=10.0, a=0.0, d=0.0, slope=0.0, lead=(NO_GAP, 0.0), wall=NO_GAP, others=None, limit=15.0
+):
+    """Vehicles on their ways; a number counts for all of them."""
+    count = len(bends)
+
+    def each(value):
+        return jnp.broadcast_to(jnp.asarray(value, jnp.float32), (count,))
+
+    zero = each(0.0)
+    start = Frenet(zero, each(v), each(a), each(d), each(slope) * each(v), zero, each(slope), zero)
+    h = LATTICE.moments
+    if others is None:
+        shape = (count, K, h)
+        nobody = Others(
+            *(jnp.full(shape, 1e4),) * 2,
+            jnp.zeros(shape),
+            *(jnp.ones((count, K)),) * 2,
+            jnp.zeros((count, K), bool),
+        )
+        others = nobody
+    return Task(
+        way=way(bends, limit), start=start, length=each(4.8), width=each(1.9), driver=drivers(count),
+        lead_gap=each(lead[0])[:, None], lead_v=each(lead[1])[:, None], wall=each(wall), other=others,
+        steering=each(0.5), wheelbase=each(2.8),
+    )  # fmt: skip
+
+
+planned = jax.jit(functools.partial(plan, LATTICE, ACC()))
+sampled = jax.jit(functools.partial(sample, LATTICE, ACC()))
+
+
+def test_quintic_and_quartic_meet_their_boundary_conditions():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        x0, v0, a0, x1, v1, a1 = rng.uniform(-3, 12, 6)
+        end = rng.uniform(1.5, 6.0)
+        t = np.linspace(0, end, 7)
+        reference = BPoly.from_derivatives([0, end], [[x0, v0, a0], [x1, v1, a1]])
+        wanted = [reference.derivative(k)(t) if k else reference(t) for k in range(4)]
+        got = quintic(*(jnp.float32(x) for x in (x0, v0, a0, x1, v1, a1, end)), jnp.asarray(t, jnp.float32))
+        for one, other in zip(got[:1], wanted[:1], strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-4 * max(1, np.abs(other).max()))
+        for one, other in zip(got[1:], wanted[1:], strict=True):  # at the end derivatives of rest count
+            np.testing.assert_allclose(one[:-1], other[:-1], atol=2e-4 * max(1, np.abs(other).max()))
+        s, v, a, _ = quartic(
+            *(jnp.float32(x) for x in (v0, a0, v1)),
+            jnp.float32(end),
+            jnp.asarray([0, end, end + 2], jnp.float32),
+        )
+        np.testing.assert_allclose([s[0], v[0], a[0]], [0, v0, a0], atol=1e-5)
+        np.testing.assert_allclose([v[1], a[1]], [v1, 0], atol=1e-4)
+        np.testing.assert_allclose(s[2] - s[1], 2 * v1, atol=1e-4)
+        # the quartic is the quintic without the fifth power: its distance is the one that has none
+        power = np.polynomial.polynomial.polyfit(
+            np.linspace(0, end, 5),
+            quartic(
+                *(jnp.float32(x) for x in (v0, a0, v1)),
+                jnp.float32(end),
+                jnp.linspace(0, end, 5).astype(jnp.float32),
+            )[0],
+            4,
+        )
+        np.testing.assert_allclose(power[1], v0, atol=5e-3)
+
+
+def test_samples_differ_along_and_across():
+    found = sampled(task(bends=(0.0, 0.02)))
+    ends = np.asarray(found.v[0, :, -1])
+    lasts = np.asarray(found.d[0, :, -1])
+    assert len(np.unique(ends.round(2))) > 2 * LATTICE.speeds
+    assert {round(float(x), 2) for x in lasts} >= {round(x, 2) for x in LATTICE.offsets}
+    # all start where the vehicle is
+    np.testing.assert_allclose(found.d[:, :, 0], 0, atol=1e-4)
+    np.testing.assert_allclose(found.v[:, :, 0], 10, atol=1e-4)
+
+
+@pytest.mark.parametrize("d, slope", [(0.0, 0.0), (0.6, -0.05), (-1.4, 0.02)])
+def test_what_is_chosen_keeps_its_bounds(d, slope):
+    bends = (0.0, 0.015, -0.03, 0.06)
+    v = np.array([14.0, 11.0, 8.0, 5.5])
+    case = task(bends, v=v, d=d, slope=slope)
+    chosen = planned(case)
+    assert chosen.safe.all()
+    x, y, t = np.asarray(chosen.x, float), np.asarray(chosen.y, float), LATTICE.dt
+    speed = np.hypot(np.diff(x), np.diff(y)) / t
+    np.testing.assert_allclose(speed, (chosen.v[:, 1:] + chosen.v[:, :-1]) / 2, atol=0.15)
+    course = np.unwrap(np.arctan2(np.diff(y), np.diff(x)))
+    bend = np.diff(course) / (speed[:, 1:] * t)
+    assert np.abs(bend).max() < np.tan(0.5) / 2.8
+    assert (np.abs(bend) * speed[:, 1:] ** 2).max() < 2.5 + 1.2
+    a = np.diff(chosen.v) / t
+    assert a.max() < 4.0 and a.min() > -8.5
+    # the lane ends 1.9 m to the right of the way: the body stays inside
+    heading = np.asarray(chosen.heading)
+    np.testing.assert_allclose(np.cos(course - (heading[:, 1:] + heading[:, :-1]) / 2), 1, atol=2e-3)
+
+
+def test_envelope_slows_for_bends_limits_and_walls():
+    case = task(bends=(0.0, 0.05), wall=np.array([60.0, NO_GAP]))
+    envelope = np.asarray(speed_envelope(case))
+    at = STEP * np.arange(POINTS)
+    b = 0.6 * 2.0
+    np.testing.assert_allclose(
+        envelope[0], np.minimum(15.0, np.sqrt(2 * b * np.maximum(60 - at, 0))), rtol=1e-4
+    )
+    np.testing.assert_allclose(envelope[1], np.sqrt(2.5 / 0.05), rtol=1e-4)
+
+
+def test_a_line_far_ahead_does_not_slow_and_a_near_one_stops():
+    free, far, near = (planned(task(v=10.0, wall=wall)) for wall in (NO_GAP, 140.0, 30.0))
+    np.testing.assert_allclose(far.v[:, :8], free.v[:, :8], atol=0.05)
+    assert free.v[0, -1] > 12
+    way_gone = np.asarray(near.x[0, -1])
+    assert way_gone <= 30.3 and near.v[0, -1] < 4
+    blocked = planned(task(v=10.0, wall=3.0))
+    np.testing.assert_allclose(np.diff(blocked.v[0, :5]), -8 * LATTICE.dt, atol=0.01)
+    assert not blocked.safe[0]
+
+
+def test_follows_a_slower_leader_without_coming_too_near():
+    chosen = planned(task(v=14.0, lead=(45.0, 6.0)))
+    gap = 45.0 + 6.0 * np.asarray(LATTICE.times()) - np.asarray(chosen.x[0])
+    assert gap.min() > 6.0 and chosen.v[0, -1] < 11.0 and chosen.safe[0]
+    stands = planned(task(v=0.0, lead=(2.2, 0.0)))
+    assert stands.x[0, -1] < 0.5
+
+
+def crossing(arrival):
+    """Somebody who is at (40, 0) `arrival` s from now, from the right, at 9 m/s."""
+    t = np.asarray(LATTICE.times())
+    shape = (1, K, LATTICE.moments)
+    x, y = np.full(shape, 1e4), np.full(shape, 1e4)
+    x[0, 1], y[0, 1] = 40.0, 9.0 * (t - arrival)
+    counts = np.zeros((1, K), bool)
+    counts[0, 1] = True
+    float32 = functools.partial(jnp.asarray, dtype=jnp.float32)
+    return Others(
+        float32(x), float32(y), jnp.full(shape, np.pi / 2, jnp.float32), jnp.full((1, K), 5.0),
+        jnp.full((1, K), 2.0), jnp.asarray(counts),
+    )  # fmt: skip
+
+
+def test_crossing_traffic_that_is_far_now_and_meets_later_is_seen():
+    alone = planned(task(v=12.0))
+    at = float(np.interp(40.0, alone.x[0], LATTICE.times()))
+    others = crossing(at)  # would meet there and then, 30 m away now
+    assert np.hypot(others.x[0, 1, 0], others.y[0, 1, 0]) > 40
+    chosen = planned(task(v=12.0, others=others))
+    dx = np.abs(np.asarray(chosen.x[0] - others.x[0, 1]))
+    dy = np.abs(np.asarray(chosen.y[0] - others.y[0, 1]))
+    assert ((dx > (4.8 + 2) / 2) | (dy > (5.0 + 1.9) / 2)).all()
+    assert chosen.safe[0]
+    # one that has long passed changes nothing
+    same = planned(task(v=12.0, others=crossing(-3.0)))
+    np.testing.assert_allclose(same.v, alone.v, atol=1e-5)
+
+
+def test_vehicles_do_not_influence_each_other():
+    bends = (0.0, 0.02, -0.04)
+    together = planned(task(bends, v=np.array([12.0, 9.0, 6.0]), wall=np.array([NO_GAP, 35.0, 12.0])))
+    alone = planned(task(bends[1:2], v=9.0, wall=35.0))
+    np.testing.assert_allclose(together.x[1], alone.x[0], atol=1e-4)
