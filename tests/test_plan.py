@@ -11,6 +11,7 @@ from traffic_worlds import drivers
 
 from limsim_jax.policies.limsim_tm.plan import (
     Lattice,
+    Merge,
     Others,
     Task,
     plan,
@@ -69,7 +70,8 @@ def task(
     return Task(
         way=way(bends, limit), start=start, length=each(4.8), width=each(1.9), driver=drivers(count),
         lead_gap=each(lead[0])[:, None], lead_v=each(lead[1])[:, None], wall=each(wall), other=others,
-        steering=each(0.5), wheelbase=each(2.8),
+        merge=Merge(*(jnp.zeros((count, K)),) * 3, jnp.zeros((count, K), bool), zero),
+        wanted=jnp.full((count, h), 1e3), steering=each(0.5), wheelbase=each(2.8),
     )  # fmt: skip
 
 
@@ -147,7 +149,7 @@ def test_envelope_slows_for_bends_limits_and_walls():
     case = task(bends=(0.0, 0.05), wall=np.array([60.0, NO_GAP]))
     envelope = np.asarray(speed_envelope(case))
     at = STEP * np.arange(POINTS)
-    b = 0.6 * 2.0
+    b = 0.8 * 2.0
     np.testing.assert_allclose(
         envelope[0], np.minimum(15.0, np.sqrt(2 * b * np.maximum(60 - at, 0))), rtol=1e-4
     )

@@ -216,4 +216,9 @@ def _joined(first: Command, second: Command, egos: Egos) -> Command:
     x, y, heading, v = (
         jnp.concatenate([a, b]) for a, b in zip(values, (much.x, much.y, much.heading, much.v), strict=True)
     )
-    return Command(trajectory=Trajectory(x=x, y=y, heading=heading, v=v, t0=much.t0, dt=much.dt), meta=meta)
+    signal = None
+    if second.signal is not None:
+        mine = jnp.zeros(rows, second.signal.dtype) if first.signal is None else first.signal
+        signal = jnp.concatenate([mine, second.signal])
+    trajectory = Trajectory(x=x, y=y, heading=heading, v=v, t0=much.t0, dt=much.dt)
+    return Command(trajectory=trajectory, meta=meta, signal=signal)

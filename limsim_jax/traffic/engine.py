@@ -56,6 +56,9 @@ from limsim_jax.types import Config, Schedule, State, Status
 PATIENCE = 20.0
 """s of waiting at the end of a wrong lane before a driver gives up the route."""
 
+FAST = 25.0
+"""m/s, speed limit above which drivers do not wait for long at the end of a wrong lane."""
+
 AT_END = 40.0
 """m from the end of a lane within which that counts."""
 
@@ -88,6 +91,7 @@ class Command:
     meta: Int[Array, " E"] | None = None  # `Meta`, or -1: decide like the traffic
     brake: Bool[Array, " N"] | None = None  # who brakes as hard as it can, egos or others
     slot: Int[Array, " E"] | None = None  # whom each row of `Egos` drives from now on, -1: nobody
+    signal: Int[Array, " E"] | None = None  # turn signal of free egos: +1 left, -1 right; others make way
 
 
 class Tick(NamedTuple):
@@ -167,13 +171,14 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
     """Who has waited `PATIENCE` s at the end of a lane that does not lead to the goal takes another goal.
 
     The nearest one that the lane does lead to, without another lane change if possible; recorded as
-    `Status.MISSED_ROUTE`.
+    `Status.MISSED_ROUTE`. On fast roads (`FAST`) drivers give up after a quarter of that.
     """
     routes = lane_map.routes
     leads_on = (routes.next_lane != NO_LANE) | routes.is_goal  # [L, G], the same for all worlds
     nearest = jnp.argmin(jnp.where(leads_on, routes.distance, jnp.inf), -1).astype(state.goal.dtype)
-    stuck = state.active & ~leads_on[state.lane, state.goal] & (state.waiting > PATIENCE)
-    stuck &= lane_map.length[state.lane] - state.s < AT_END
+    to_end = lane_map.length[state.lane] - state.s
+    patience = jnp.where(lane_map.speed_limit[state.lane] > FAST, PATIENCE / 4, PATIENCE)
+    stuck = state.active & ~leads_on[state.lane, state.goal] & (state.waiting > patience) & (to_end < AT_END)
     goal = nearest[state.lane]
     changes = stuck & leads_on.any(-1)[state.lane]
     return replace(
@@ -277,6 +282,9 @@ def drive(
     command = Command() if command is None else command
     if command.slot is not None:
         state = assign(lane_map, state, boxes(lane_map, state), command.slot)
+    if command.signal is not None:  # stands on both lanes for those who decide now
+        shows = state.egos.free & (command.signal != 0)
+        state = replace(state, side=at_slots(state.egos, command.signal, state.side, shows))
     if schedule is not None:
         state = enter(config, lane_map, schedule, state)
     state, decision = decide(config, traffic, lane_map, state, command)

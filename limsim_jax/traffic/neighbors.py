@@ -13,13 +13,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt
 
-from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
 from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.types import Config, State
 
 _POSITION_BITS = 18  # of a sort key, at most: positions on a lane to 1 / 2^18 of its length
 _FEWEST_BITS = 14  # with fewer left for the position, the number of the entry stays out of the key
+_OVER_LINE = 0.3  # m of room that a body which leaves a lane keeps to those who stay there
 _UPSTREAM = 2  # predecessors of a lane that are searched for followers
 
 
@@ -143,10 +144,15 @@ def sort_vehicles(lane_map: LaneMap, state: State) -> Order:
 
 
 def other_lane(lane_map: LaneMap, state: State) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
-    """The second lane that a vehicle which changes lanes is on, else NO_LANE, and its s there (m)."""
+    """The second lane that a vehicle which changes lanes is on, else NO_LANE, and its s there (m).
+
+    That is the lane it moves to from the start on, and the one it comes from as long as its body is there.
+    """
     side = jnp.where(state.crossed, -state.side, state.side)
     lane = jnp.where(side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
-    lane = jnp.where(state.active & (side != 0), lane, NO_LANE)
+    reach = jnp.abs(state.d) + state.shape.width / 2 + _OVER_LINE
+    there = ~state.crossed | (reach > width(lane_map, state.lane, state.s) / 2)
+    lane = jnp.where(state.active & (side != 0) & there, lane, NO_LANE)
     return lane, side_s(lane_map, state.lane, state.s, side)
 
 

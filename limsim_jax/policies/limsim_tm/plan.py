@@ -33,6 +33,8 @@ class Task(NamedTuple):
     lead_v: Float[Array, "V J"]  # m/s
     wall: Float[Array, " V"]  # m from the front bumper to the place beyond which it must not go
     other: Others
+    merge: Merge
+    wanted: Float[Array, "V H"]  # m/s, speed that was decided on; fast where nothing was
     steering: Float[Array, " V"]  # rad, largest; with `wheelbase` it bounds the curvature
     wheelbase: Float[Array, " V"]
 
@@ -46,6 +48,16 @@ class Others(NamedTuple):
     length: Float[Array, "V K"]  # m
     width: Float[Array, "V K"]
     counts: Bool[Array, "V K"]  # False: is none of our business
+
+
+class Merge(NamedTuple):
+    """Traffic on the lane that the route needs next, to which the vehicle adapts its speed."""
+
+    s: Float[Array, "V K"]  # m from centre to centre along the way, now
+    v: Float[Array, "V K"]  # m/s
+    length: Float[Array, "V K"]  # m
+    there: Bool[Array, "V K"]
+    urgency: Float[Array, " V"]  # 0: needs no other lane, 1: must change now
 
 
 class Plan(NamedTuple):
@@ -100,13 +112,16 @@ class Lattice:
     offsets: tuple[float, ...] = (0.0, -0.4, 0.4)
     lateral_time: float = 4.0
     # weights
-    efficiency: float = 3.0
+    efficiency: float = 0.3
+    speeding: float = 1.0
     acceleration: float = 0.25
     jerk: float = 0.1
     offset: float = 0.5
     bending: float = 40.0
-    headway: float = 4.0
+    headway: float = 8.0
     proximity: float = 0.6
+    decision: float = 0.05
+    merging: float = 6.0
 
     @property
     def moments(self) -> int:
@@ -125,7 +140,9 @@ _MARGIN = 0.5  # m kept ahead of and behind others
 _SIDE = 0.25  # m kept beside others
 _REACTION = 0.5  # s at the present speed before braking hard: see `_rss`
 _RSS_UNTIL = 1.5  # s; later there will be another plan
-_APPROACH = 0.6  # of the comfortable deceleration: slows down for bends, limits and lines ahead
+_APPROACH = 0.6  # of the comfortable deceleration: slows down for bends and limits ahead
+_STOPPING, _STOPPING_LATE = 0.8, 1.5  # of it: stops at lines, and at the end of a lane that it has to leave
+_MERGE_BRAKING = 2.0  # m/s^2
 _MIN_LATERAL = 10.0  # m, least distance in which the offset changes
 
 
@@ -180,7 +197,9 @@ def speed_envelope(task: Task) -> Float[Array, "V M"]:
     at = way.step * jnp.arange(way.x.shape[-1], dtype=top.dtype)[None]
     square = lax.cummin(top * top + b * at, axis=1, reverse=True) - b * at
     room = jnp.maximum(task.wall[:, None] - at, 0)
-    return jnp.sqrt(jnp.maximum(jnp.minimum(square, b * room), 0))
+    # who still has to find a gap does not lose the speed of those it joins
+    b = driver.b * jnp.where(task.merge.urgency > 0, _STOPPING_LATE, _STOPPING)
+    return jnp.sqrt(jnp.maximum(jnp.minimum(square, 2 * b[:, None] * room), 0))
 
 
 def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
@@ -242,13 +261,17 @@ def _along(
     start, t = task.start, lattice.times()[None, None]
     v0, a0 = start.v[:, None, None], jnp.clip(start.a, -8.0, 4.0)[:, None, None]
     # end speeds from a standstill to the fastest that is allowed where it would be then
-    top = jnp.maximum(jnp.max(envelope[:, : max(2, int(30 / task.way.step))], -1), start.v)
+    top = jnp.max(envelope[:, : max(2, int(30 / task.way.step))], -1)
     share = jnp.linspace(0.0, 1.0, lattice.speeds)
     parts = []
     for end in lattice.horizons:
         reach = jnp.minimum(top, start.v + 1.5 * end)[:, None]
         low = jnp.maximum(start.v - 3.0 * end, 0)[:, None]
         parts.append(quartic(v0, a0, (low + share[None] * (reach - low))[:, :, None], end, t))
+        # as fast as the next leader, or as now
+        behind = jnp.where(task.lead_gap < NO_GAP / 2, task.lead_v, start.v[:, None])
+        first = jnp.take_along_axis(behind, jnp.argmin(task.lead_gap, -1)[:, None], 1)
+        parts.append(quartic(v0, a0, first[:, :, None], end, t))
     parts.append(quartic(v0, a0, v0, 2.0, t))
     # stops at the wall
     distance = jnp.maximum(task.wall, 0.05)[:, None, None]
@@ -332,8 +355,7 @@ def _costs(
         return (low + jnp.clip(u - k.astype(u.dtype), 0, 1) * (high - low)).reshape(s.shape)
 
     allowed = along(envelope)
-    desired = jnp.maximum(envelope[:, :1, None], 5.0)
-    slow = jnp.maximum(allowed - v, 0) / desired
+    slow, over = jnp.maximum(allowed - v, 0), jnp.maximum(v - allowed, 0)
     gap = jnp.minimum(
         task.lead_gap[:, None, None] + task.lead_v[:, None, None] * t[..., None] - s[..., None],
         NO_GAP,
@@ -344,16 +366,17 @@ def _costs(
     wanted = each(driver.s0)[..., None] + jnp.maximum(v[..., None] * dynamic, 0)
     close = jnp.maximum(1 - gap / wanted, 0).max(-1)
     cost = (
-        lattice.efficiency * jnp.mean(slow * slow, -1)
+        lattice.efficiency * jnp.mean(slow, -1)
+        + lattice.speeding * jnp.mean(over * over, -1)
         + lattice.acceleration * jnp.mean(a * a, -1)
         + lattice.jerk * jnp.mean(jerk * jerk, -1)
         + lattice.offset * jnp.mean(d * d, -1)
         + lattice.bending * jnp.mean((bend * speed) ** 2, -1) / 25
         + lattice.headway * jnp.mean(close * close, -1)
+        + lattice.decision * jnp.mean(jnp.square(jnp.maximum(v - task.wanted[:, None], 0)), -1)
     )
 
     # bounds
-    over = jnp.maximum(v - allowed - 0.5, 0)
     beyond = jnp.maximum(s - jnp.maximum(each(task.wall), 0) - 0.3, 0)
     b_ego, b_lead = each(jnp.minimum(driver.b_max, 7.0)), 8.0
     lead_v = task.lead_v[:, None, None]
@@ -367,8 +390,7 @@ def _costs(
     edge = jnp.maximum(edge - jnp.maximum(edge[..., :1], 0.05), 0)  # who is out there already may come back
     acceleration = jnp.maximum(a - 4.0, 0) + jnp.maximum(-a - each(driver.b_max) - 0.5, 0)
     broken = (
-        0.02 * jnp.mean(over * over, -1)
-        + 0.5 * jnp.max(beyond, -1)
+        0.5 * jnp.max(beyond, -1)
         + 0.1 * jnp.max(rss, -1)
         + 10 * jnp.max(tight, -1)
         + 0.1 * jnp.max(lateral, -1)
@@ -378,7 +400,42 @@ def _costs(
     touch, near = _meet(lattice, task, x, y, heading)
     fade = jnp.exp(-t / _FORGET)
     broken = broken + _TOUCH / _BROKEN * jnp.max(touch * fade, -1) + jnp.sum(touch * fade, -1) * 0.2
+    missing = _no_gap(task, s, v, t)
+    cost = cost + lattice.merging * task.merge.urgency[:, None] * jnp.min(missing + 0.05 * t, -1)
     return cost + lattice.proximity * jnp.mean(near, -1), broken
+
+
+def room_needed(
+    v: Float[Array, "*#b"],
+    v_ahead: Float[Array, "*#b"],
+    braking: Float[Array, "*#b"] | float,
+    headway: float = 0.3,
+) -> Float[Array, "*#b"]:
+    """Gap, m, that a lane change must leave between somebody at `v` and somebody ahead at `v_ahead`, m/s.
+
+    To react, to brake to the other's speed with `braking`, m/s^2, and for a short `headway`, s, after that,
+    which the other makes by itself if it is faster.
+    """
+    faster = jnp.maximum(v - v_ahead, 0)
+    short = jnp.maximum(headway * v - jnp.maximum(v_ahead - v, 0), 0)
+    return 2.0 + short + 0.5 * faster + faster * faster / (2 * braking)
+
+
+def _no_gap(task: Task, s: Array, v: Array, t: Array) -> Float[Array, "V S H"]:
+    """How far the vehicle is from a gap in the traffic that it has to join: 0 level with one that will do.
+
+    It will do if who comes from behind, or we, can brake to the other's speed with `_MERGE_BRAKING`.
+    """
+    merge, missing = task.merge, jnp.zeros_like(s)
+    for k in range(merge.s.shape[1]):
+        own = lambda value: value[:, k, None, None]  # noqa: B023, E731
+        ahead = own(merge.s) + own(merge.v) * t - s
+        lead = ahead > 0
+        need = room_needed(jnp.where(lead, v, own(merge.v)), jnp.where(lead, own(merge.v), v), _MERGE_BRAKING)
+        gap = jnp.abs(ahead) - (own(merge.length) + task.length[:, None, None]) / 2
+        short = jnp.clip((need - gap) / 10.0, 0, 3.0)
+        missing = jnp.maximum(missing, jnp.where(own(merge.there), short, 0))
+    return missing
 
 
 def _meet(

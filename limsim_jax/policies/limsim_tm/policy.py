@@ -11,12 +11,15 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.limsim_tm.plan import Lattice, Others, Task, plan
+from limsim_jax.policies.limsim_tm.decide import Told, grouped, neighbours, tell
+from limsim_jax.policies.limsim_tm.plan import Lattice, Merge, Others, Task, plan, room_needed
+from limsim_jax.policies.limsim_tm.search import Settings, no_plan, shifted
 from limsim_jax.policies.predict import Prediction, constant_velocity
 from limsim_jax.policies.reference import Way, beside, body_lane, motion_on, way_ahead
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.ego import Trajectory, at_slots
 from limsim_jax.traffic.engine import Command, Decision, Traffic, decide
+from limsim_jax.traffic.lane_change import urgency
 from limsim_jax.types import Config, State
 
 
@@ -25,6 +28,8 @@ class Memory(NamedTuple):
 
     slot: Int[Array, " E"]  # whose it is
     side: Int[Array, " E"]  # lane change under way: 1 left, -1 right, 0 none
+    told: Told  # by the last search
+    since: Float[Array, " E"]  # s, time of that search
 
 
 class Around(NamedTuple):
@@ -41,86 +46,168 @@ class Around(NamedTuple):
 
 @dataclass(frozen=True)
 class LimSimTM:
-    """Decides like the planners of LimSim's traffic manager: search for a manoeuvre, then plan a trajectory.
+    """Searches for a manoeuvre, then plans a trajectory; the rules of the road are those of the traffic.
 
     Attributes:
       others: vehicles of the traffic that it drives beside the egos, see `AreaOfInterest`.
       nearest: others that are looked at.
+      search: for manoeuvres; None: lane changes by MOBIL.
+      search_every: decisions from one search to the next.
+      obedience: desired speed of the egos, as a share of the speed limit at most.
       lattice: of trajectories.
       traffic: rules of the road, and how drivers follow each other.
     """
 
     others: int = 0
     nearest: int = 8
+    search: Settings | None = field(default_factory=lambda: Settings(simulations=40))
+    search_every: int = 3
+    obedience: float = 0.985
     lattice: Lattice = field(default_factory=Lattice)
     traffic: Traffic = field(default_factory=Traffic)
 
     free = True
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Memory:
-        """No lane change under way."""
+        """No lane change under way, nothing searched."""
         del config, lane_map
-        return Memory(state.egos.slot, jnp.zeros_like(state.egos.slot))
+        rows = state.egos.slot.shape[0]
+        size = Settings() if self.search is None else self.search
+        told = Told(
+            side=jnp.zeros(rows, jnp.int32),
+            v=jnp.full((rows, size.steps + 1), _ANY_SPEED),
+            action=no_plan(rows, size.decisions),
+            value=jnp.zeros(rows),
+        )
+        return Memory(state.egos.slot, jnp.zeros_like(state.egos.slot), told, jnp.full(rows, -1e3))
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Memory, key: jax.Array
     ) -> tuple[Command, Memory]:
         """One trajectory for every ego."""
-        del key
         slot = state.egos.slot
-        side = jnp.where(memory.slot == slot, memory.side, 0)
+        drives = (slot >= 0) & state.active[slot]
+        same = memory.slot == slot
+        side = jnp.where(same, memory.side, 0)
         wish, decision = rules(config, self.traffic, lane_map, state, side)
         lane, s = body_lane(lane_map, state, slot)
         d, goal = state.d[slot], state.goal[slot]
 
-        times = self.lattice.times()
         wall = decision.obstacles.gap[:, -1] - state.driver.s0
-        prediction = constant_velocity(lane_map, state, times, stop=wall)
+        prediction = constant_velocity(lane_map, state, self.lattice.times(), stop=wall)
+        own = way_ahead(lane_map, lane, s, goal, points=_POINTS, step=_STEP)
+        nearby = around(state, prediction, own, slot, self.nearest)
+
+        told, since = memory.told, jnp.where(same, memory.since, -1e3)
+        now = config.time(state.step)
+        if self.search is not None:
+            due = (state.step // config.decision_every) % self.search_every == 0
+            told = self._search(lane_map, state, drives, lane, side, wish, own, nearby, wall, told, due, key)
+            since = jnp.where(due, now, since)
+            wish = jnp.where(now - since < 1e2, told.side, wish)
 
         # go on with a lane change until the middle of the body is on the other lane, as long as it is safe
         side = jnp.where(side * d < -0.3, 0, side)
-        begins = (side == 0) & (jnp.abs(d) < 0.6)
-        side = jnp.where(begins, wish, side)
-        other_lane, other_s, other_d, there = beside(lane_map, lane, s, d, side)
-        way = way_ahead(lane_map, other_lane, other_s, goal, points=_POINTS, step=_STEP)
-        found = around(state, prediction, way, slot, self.nearest)
-        side = jnp.where(there & self._fits(state, slot, found), side, 0)
+        need = lane_map.routes.lanes_to_go[lane, goal]
+        room = lane_map.routes.change_distance[lane, goal] - s
+        press = urgency(need, room, state.v[slot], state.driver.lane_change_time[slot])
+        wish = jnp.where((wish * need < 0) & (press > 0.3), 0, wish)
+        look = jnp.where(side != 0, side, jnp.where(wish != 0, wish, jnp.sign(need)))
+        other_lane, other_s, other_d, there = beside(lane_map, lane, s, d, look)
+        target = way_ahead(lane_map, other_lane, other_s, goal, points=_POINTS, step=_STEP)
+        traffic = around(state, prediction, target, slot, self.nearest)
+        begins = (side == 0) & (jnp.abs(d) < 0.6) & self._may_change(lane_map, state, slot, lane, look)
+        # changes to the left and to the right begin in turns, as in all traffic
+        begins &= look == jnp.where((state.step // config.decision_every) % 2 == 0, 1, -1)
+        most = jnp.where(need * look > 0, 2.5 + 2.0 * press, 2.0)
+        begins &= ((wish == look) | (need * look > 0)) & self._fits(state, slot, traffic, most)
+        goes_on = (side != 0) & self._fits(state, slot, traffic, _HARD, 0.0)
+        side = jnp.where(there & (begins | goes_on), look, 0)
         changes = side != 0
-        own = way_ahead(lane_map, lane, s, goal, points=_POINTS, step=_STEP)
-        way = jax.tree.map(
-            lambda a, b: jnp.where(jnp.reshape(changes, (-1,) + (1,) * (a.ndim - 1)), a, b), way, own
-        )
-        d = jnp.where(changes, other_d, d)
-        found = around(state, prediction, way, slot, self.nearest)
 
-        task = self._task(state, decision, way, slot, d, found, prediction)
+        def choose(a: Array, b: Array) -> Array:
+            return jnp.where(changes.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
+
+        way, found = jax.tree.map(choose, (target, traffic), (own, nearby))
+        d = jnp.where(changes, other_d, d)
+        merge = Merge(
+            traffic.s, traffic.v, state.shape.length[traffic.slot], traffic.there & traffic.on_way,
+            jnp.where(there & (look * need > 0) & ~changes, jnp.clip(press, 0.2, 1.0), 0.0),
+        )  # fmt: skip
+        task = self._task(
+            state, decision, way, slot, d, found, prediction, merge, self._speed(told, now - since)
+        )
         chosen = plan(self.lattice, self.traffic.model, task)
         trajectory = Trajectory(
             x=chosen.x, y=chosen.y, heading=chosen.heading, v=chosen.v,
             t0=config.time(state.step), dt=self.lattice.dt,
         )  # fmt: skip
-        return Command(trajectory=trajectory), Memory(slot, side)
+        return Command(trajectory=trajectory, signal=side), Memory(slot, side, told, since)
 
-    def _fits(self, state: State, slot: Int[Array, " V"], found: Around) -> Bool[Array, " V"]:
-        """Whether there is room on the way: nobody beside, nobody has to brake hard."""
-        model, driver = self.traffic.model, jax.tree.map(lambda x: x[slot][:, None], state.driver)
-        v, zero = state.v[slot][:, None], jnp.zeros_like(found.v)
-        lead = found.on_way & (found.s > 0) & (found.gap > 0)
-        lag = found.on_way & (found.s <= 0) & (found.gap > 0)
-        beside = found.on_way & (found.gap <= 1.0)
-        wide = jnp.broadcast_to(v, found.v.shape)
-        own = model(
-            driver, gap=jnp.where(lead, found.gap, NO_GAP), v=wide,
-            v_lead=jnp.where(lead, found.v, wide), a_lead=zero, v0=wide + 1,
-        )  # fmt: skip
-        theirs = jax.tree.map(lambda x: x[found.slot], state.driver)
-        v_lag = jnp.maximum(found.v, 0)
-        behind = model(
-            theirs, gap=jnp.where(lag, found.gap, NO_GAP), v=v_lag,
-            v_lead=jnp.where(lag, wide, v_lag), a_lead=zero, v0=v_lag + 1,
-        )  # fmt: skip
-        hard = (lead & (own < -_EASY)) | (lag & (behind < -_EASY)) | beside
-        return ~hard.any(-1)
+    def _search(
+        self, lane_map: LaneMap, state: State, drives: Array, lane: Array, side: Array, wish: Array, own: Way,
+        nearby: Around, wall: Array, told: Told, due: Array, key: jax.Array,
+    ) -> Told:  # fmt: skip
+        """What the search tells all planned vehicles, if it is `due`; else what it told them before.
+
+        A loop of at most one pass: where no world of a batch is due, it costs nothing.
+        """
+        settings, slot = self.search, state.egos.slot
+        if settings is None:
+            return told
+
+        def look(carry: tuple[Array, Told]) -> tuple[Array, Told]:
+            times = settings.dt * jnp.arange(settings.steps + 1, dtype=jnp.float32)
+            prediction = constant_velocity(lane_map, state, times, stop=wall)
+            counts = neighbours(nearby.gap, nearby.d, nearby.there)
+            members = grouped(
+                lane_map, state, slot, drives, lane, jnp.where(side != 0, side, wish),
+                prediction.x[:, 0], prediction.y[:, 0], nearby.slot, counts,
+            )  # fmt: skip
+            bodies, _ = body_lane(lane_map, state, jnp.arange(state.lane.shape[0]))
+            sides = at_slots(state.egos, side, state.side)
+            new = tell(
+                settings, lane_map, state, slot, members, own, nearby.slot, prediction, bodies, sides, wall,
+                shifted(carry[1].action), key,
+            )  # fmt: skip
+            return jnp.zeros_like(carry[0]), new
+
+        return lax.while_loop(lambda carry: carry[0], look, (due, told))[1]
+
+    def _may_change(
+        self, lane_map: LaneMap, state: State, slot: Array, lane: Array, side: Int[Array, " V"]
+    ) -> Bool[Array, " V"]:
+        """Whether marks and vehicle class allow the change, outside junctions."""
+        left = side > 0
+        allowed = jnp.where(left, lane_map.may_change_left[lane], lane_map.may_change_right[lane])
+        other = jnp.where(left, lane_map.left[lane], lane_map.right[lane])
+        usable = ((lane_map.access[other] >> state.shape.vehicle_class[slot]) & 1) == 1
+        return allowed & usable & ~lane_map.is_connector[lane] & (state.lane[slot] == lane)
+
+    def _speed(self, told: Told, late: Float[Array, " V"]) -> Float[Array, "V H"]:
+        """Speeds that the search had in mind, at the moments of the plan, m/s."""
+        if self.search is None:
+            return jnp.full((late.shape[0], self.lattice.moments), _ANY_SPEED)
+        at = (late[:, None] + self.lattice.times()[None]) / self.search.dt
+        k = jnp.clip(at.astype(jnp.int32), 0, told.v.shape[1] - 2)
+        low, high = jnp.take_along_axis(told.v, k, 1), jnp.take_along_axis(told.v, k + 1, 1)
+        v = low + jnp.clip(at - k.astype(at.dtype), 0, 1) * (high - low)
+        return jnp.where(late[:, None] < 1e2, v, _ANY_SPEED)
+
+    def _fits(
+        self,
+        state: State,
+        slot: Int[Array, " V"],
+        found: Around,
+        most: Float[Array, " V"] | float,
+        headway: float = 0.3,
+    ) -> Bool[Array, " V"]:
+        """Whether there is room on the way: nobody beside, nobody has to brake harder than `most` m/s^2."""
+        most = jnp.broadcast_to(jnp.asarray(most, found.v.dtype), slot.shape)[:, None]
+        v = state.v[slot][:, None]
+        ahead, other = found.s > 0, jnp.maximum(found.v, 0)
+        need = room_needed(jnp.where(ahead, v, other), jnp.where(ahead, other, v), most, headway)
+        return ~(found.on_way & (found.gap < need)).any(-1)
 
     def _task(
         self,
@@ -131,8 +218,17 @@ class LimSimTM:
         d: Array,
         found: Around,
         prediction: Prediction,
+        merge: Merge,
+        wanted: Array,
     ) -> Task:
         driver = jax.tree.map(lambda x: x[slot], state.driver)
+        egos = jnp.arange(slot.shape[0]) < slot.shape[0] - self.others
+        driver = replace(
+            driver,
+            speed_factor=jnp.where(
+                egos, jnp.minimum(driver.speed_factor, self.obedience), driver.speed_factor
+            ),
+        )
         index, gap = decision.obstacles.other[slot, :-1], decision.obstacles.gap[slot, :-1]
         ahead = found.there & found.on_way & (found.s > 0)
         nearest = jnp.argmin(jnp.where(ahead, found.gap, NO_GAP), -1)[:, None]
@@ -155,13 +251,17 @@ class LimSimTM:
                 prediction.x[found.slot], prediction.y[found.slot], prediction.heading[found.slot],
                 state.shape.length[found.slot], state.shape.width[found.slot], found.there & ~follows,
             ),
+            merge=merge,
+            wanted=wanted,
             steering=jnp.full_like(d, 0.5),
             wheelbase=state.shape.wheelbase[slot],
         )  # fmt: skip
 
 
 _POINTS, _STEP = 80, 2.0  # of a way, m
-_EASY = 2.5  # m/s^2, the hardest braking that a lane change may ask of anybody
+_ANY_SPEED = 1e3  # m/s, where nobody has searched yet
+_NEXT_LANE = 5.0  # m off the way, from which somebody may be changing to it
+_HARD = 4.0  # m/s^2, the hardest braking that a lane change may ask of anybody; then it is given up
 
 
 def rules(
@@ -209,6 +309,7 @@ def around(state: State, prediction: Prediction, way: Way, slot: Int[Array, " V"
     on_way = (
         there & (jnp.abs(d) < half / 2 + state.shape.width[slot][:, None] / 2 + 0.1) & (jnp.cos(turned) > 0.3)
     )
-    on_way &= jnp.abs(s) < way.reach
+    joins = there & (state.side[index] * jnp.sign(d).astype(jnp.int32) < 0) & (jnp.abs(d) < _NEXT_LANE)
+    on_way = (on_way | joins) & (jnp.abs(s) < way.reach)
     lengths = (state.shape.length[index] + state.shape.length[slot][:, None]) / 2
     return Around(index, there, s, d, jnp.abs(s) - lengths, state.v[index] * jnp.cos(turned), on_way)

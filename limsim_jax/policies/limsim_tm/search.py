@@ -1,0 +1,759 @@
+"""Decisions of a small group of vehicles, together: decoupled UCT over meta-actions, `G` vehicles at once.
+
+Every vehicle keeps its own statistics of its own five meta-actions in every node and chooses by UCB1 on
+its own utility; the joint action leads on to the next node (decoupled UCT: Finnsson and Bjornsson, AAAI
+2008; Tak, Lanctot, Winands, CIG 2014). Utilities mix the own reward with that of the rest of the group by
+the social value orientation, u_i = cos(svo_i) r_i + sin(svo_i) mean r_j (Schwarting et al., PNAS 2019).
+
+A simulation always drives from the root to the horizon: along the tree by chosen actions, from there on
+by the default policy. So a node holds statistics and no state, and a batch wastes nothing: whoever leaves
+the tree early spends the same steps on his rollout. Rows are read by one gather, and written by arithmetic
+over the whole table, which is small: scatters are loops on a CPU. `computed_once` stands where values of
+all pairs are used more than once: it halves the time.
+
+Arrays are those of one group, `[G]`, `[G, K]`, ..., and may have one more axis behind, which is a batch:
+`vmap` of `search` puts its axis there, for loops over the last axis are those that become vector code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from limsim_jax.numerics import computed_once
+from limsim_jax.traffic.car_following import NO_GAP, ballistic
+from limsim_jax.traffic.ego import Meta
+from limsim_jax.types import Driver
+
+ACTIONS = 5
+"""KEEP, ACCELERATE, DECELERATE, LEFT, RIGHT: those of `traffic.ego.Meta` but STOP."""
+
+
+class Conflicts(NamedTuple):
+    """Vehicles on different ways, which cross or merge. Distances are positions `s` on the own way, m.
+
+    While `i` is between `begin[i, j]` and `end[i, j]`, it is where the way of `j` runs: with its front
+    past `begin` and its rear not yet past `end`. `NO_GAP` in both where the ways do not touch.
+    """
+
+    shift: Float[
+        Array, "G G"
+    ]  # m: `s` of j on the way of i is s_j + shift[i, j]; of ways that merge or are one
+    meets: Float[Array, "G G"]  # m, where i comes onto lanes of j: -NO_GAP on the same road, NO_GAP never
+    begin: Float[Array, "G G"]
+    end: Float[Array, "G G"]
+    gives_way: Bool[Array, "G G"]  # i to j
+    other_beside: Bool[Array, "G K"]  # the predictions of this other are in the coordinates of i
+    other_begin: Float[Array, "G K"]
+    other_end: Float[Array, "G K"]
+    other_in: Float[Array, "G K"]  # s from now: the other is there from then ...
+    other_out: Float[Array, "G K"]  # ... until then
+    gives_way_to_other: Bool[Array, "G K"]
+
+
+def no_conflicts(vehicles: int, others: int) -> Conflicts:
+    """All on one road."""
+    own, other = (vehicles, vehicles), (vehicles, others)
+    return Conflicts(
+        shift=jnp.zeros(own),
+        meets=jnp.full(own, -NO_GAP),
+        begin=jnp.full(own, NO_GAP),
+        end=jnp.full(own, NO_GAP),
+        gives_way=jnp.zeros(own, bool),
+        other_beside=jnp.ones(other, bool),
+        other_begin=jnp.full(other, NO_GAP),
+        other_end=jnp.full(other, NO_GAP),
+        other_in=jnp.full(other, NO_GAP),
+        other_out=jnp.full(other, NO_GAP),
+        gives_way_to_other=jnp.zeros(other, bool),
+    )
+
+
+class Scene(NamedTuple):
+    """`G` vehicles that are decided together and `K` others, on a corridor of `L` parallel lanes.
+
+    Lanes count from 0 at the right; `s` runs along the corridor and `y` to the left from the centre of
+    lane 0. Vehicles on other ways have corridors of their own, related by `conflicts`. The others are
+    given at the `H = decisions * substeps + 1` moments of the search, from now on; put one that is not on
+    the corridor (yet) at a `y` far away.
+    """
+
+    active: Bool[Array, " G"]
+    s: Float[Array, " G"]  # m, front bumper
+    v: Float[Array, " G"]  # m/s
+    a: Float[Array, " G"]  # m/s^2, now
+    lane: Int[Array, " G"]
+    d: Float[Array, " G"]  # m, offset from the centre of that lane
+    aim: Int[Array, " G"]  # lane that it is moving to, or `lane`
+    length: Float[Array, " G"]  # m
+    width: Float[Array, " G"]  # m
+    v0: Float[Array, " G"]  # m/s, desired speed
+    driver: Driver  # [G]
+    first_lane: Int[Array, " G"]  # lanes that it may use: first_lane .. last_lane
+    last_lane: Int[Array, " G"]
+    wanted_first: Int[Array, " G"]  # lanes that lead on along its route
+    wanted_last: Int[Array, " G"]
+    to_go: Float[Array, " G"]  # m until it must be in one of them
+    stop: Float[Array, "G L"]  # m, position `s` before which it must stop if in that lane, NO_GAP if nowhere
+    other_active: Bool[Array, " K"]
+    other_s: Float[Array, "K H"]  # m, front bumper
+    other_y: Float[Array, "K H"]  # m
+    other_v: Float[Array, "K H"]  # m/s
+    other_length: Float[Array, " K"]
+    other_width: Float[Array, " K"]
+    conflicts: Conflicts
+    lane_width: Float[Array, ""]  # m
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Size of the search, and what a reward is made of. Static: other values are another program."""
+
+    simulations: int = 50
+    decisions: int = 5
+    substeps: int = 3  # per decision
+    dt: float = 0.5  # s, sub-step
+    exploration: float = 0.7  # of UCB1, on utilities that are scaled to 0..1
+    lateral_speed: float = 1.17  # m/s of a lane change
+    # rewards, as shares of a reward that is 1 for driving at the desired speed in comfort
+    progress: float = 0.7
+    lane: float = 0.3  # per lane away from those that lead on
+    comfort: float = 0.3  # at 4 m/s^2, grows as the square
+    jerk: float = 0.05  # at a change of 4 m/s^2 within a sub-step, grows as the square
+    change: float = 0.04  # once for each lane change
+    push: float = 0.3  # while others must brake with 4 m/s^2 for a vehicle that moved before them
+    right_of_way: float = 0.5  # while in the way of one that goes first
+    crash: float = 1.5  # once
+
+    @property
+    def steps(self) -> int:
+        """Sub-steps from now to the horizon."""
+        return self.decisions * self.substeps
+
+
+class Plan(NamedTuple):
+    """What the search found: the most visited actions, continued by the default policy."""
+
+    action: Int[Array, "G D"]  # `Meta`, per decision
+    value: Float[Array, " G"]  # utility of the plan
+    reward: Float[Array, " G"]  # own reward of the plan, about 0..1
+    crashed: Bool[Array, " G"]  # the plan ends in a collision, or past a stop
+    visits: Float[Array, "G 5"]  # at the root
+    s: Float[Array, "G H"]  # m, at the moments of the predictions
+    y: Float[Array, "G H"]  # m from the centre of lane 0
+    v: Float[Array, "G H"]  # m/s
+    aim: Float[Array, "G H"]  # lane
+
+
+def no_plan(vehicles: int, decisions: int) -> Int[Array, "G D"]:
+    """`previous` of a first search."""
+    return jnp.full((vehicles, decisions), Meta.ACCELERATE, jnp.int32)
+
+
+def shifted(action: Int[Array, "G D"], decisions: int = 1) -> Int[Array, "G D"]:
+    """`previous` for a search so many decisions after that which gave `action`."""
+    rest = jnp.full_like(action[:, :decisions], Meta.ACCELERATE)
+    return jnp.concatenate([action[:, decisions:], rest], 1)
+
+
+def search(settings: Settings, scene: Scene, previous: Int[Array, "G D"], key: Key[Array, ""]) -> Plan:
+    """Decide for the vehicles of one group.
+
+    Args:
+      settings: static.
+      scene: the group and its surroundings; `vmap` over groups.
+      previous: actions to try first, of the search before (`shifted`) or `no_plan`.
+      key: orders actions that have not been tried yet. Same key, same plan.
+    """
+    noise = jax.random.uniform(key, (scene.s.shape[0], ACTIONS), scene.s.dtype)
+    return _batch_last(lambda *of: _search(settings, *of))(_in_floats(scene), previous, noise)
+
+
+def play(settings: Settings, scene: Scene, actions: Int[Array, "G D"]) -> Plan:
+    """The plan in which the vehicles take these actions (-1: the default policy); no `visits`."""
+    return _batch_last(lambda *of: _play(settings, *of))(_in_floats(scene), actions)
+
+
+def _in_floats(scene: Scene) -> Scene:
+    """Lanes are places to the left: floats from here on."""
+    names = "lane", "aim", "first_lane", "last_lane", "wanted_first", "wanted_last"
+    lanes = {name: getattr(scene, name).astype(scene.s.dtype) for name in names}
+    return scene._replace(**lanes, lane_width=scene.lane_width[None])
+
+
+def _batch_last(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, but `vmap` puts the axis it maps over last in all arrays."""
+    mapped = custom_vmap(function)
+
+    @mapped.def_vmap
+    def _(size: int, batched: Any, *of: Any) -> tuple[Any, Any]:
+        def last(x: Array, has: bool) -> Array:
+            return jnp.moveaxis(x, 0, -1) if has else jnp.broadcast_to(x[..., None], (*x.shape, size))
+
+        result = mapped(*jax.tree.map(last, of, tuple(batched)))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), result), jax.tree.map(lambda _: True, result)
+
+    return mapped
+
+
+# ---- what happens within a decision
+
+
+class _Motion(NamedTuple):
+    """State of the group; `[G]`."""
+
+    s: Array
+    v: Array
+    a: Array
+    y: Array
+    aim: Array  # lane, as a float
+
+
+class _Score(NamedTuple):
+    """What it has earned so far; `[G]`."""
+
+    reward: Array
+    alive: Array  # has not collided
+
+
+class _Pairs(NamedTuple):
+    """What does not change within a search, of each vehicle and each of `M`: the group, or the others."""
+
+    length: Array  # [M]
+    shift: Array  # [G, M]
+    far: Array  # m, position (in coordinates of i) that m must have passed to be on the way of i
+    merges: Array  # they share a lane whatever `y`
+    wide: Array  # m, both half widths
+    begin: Array
+    end: Array
+    window: tuple[Array, Array]  # where (of the group) or when (the others) m enters and leaves the conflict
+    crosses: Array
+    gives_way: Array
+    behind: float  # share of the loss when m runs into the rear of i
+
+
+class _Bodies(NamedTuple):
+    """`[M]`."""
+
+    s: Array
+    y: Array
+    v: Array
+
+
+_FAR = 4 * NO_GAP
+_MARGIN_S, _MARGIN_Y = 0.5, 0.15  # m, added to lengths and widths in collision checks
+_LEAST_GAP = 0.5  # m, formulas of car following are evaluated here below it
+_STARTING = 3.0  # m/s, what a vehicle that stands is taken to drive through a conflict at
+_MEETING = 1.0  # s, time kept clear before and after one with right of way
+_MOVED = 0.5  # m to the side: it has left the place behind its old leader
+_DECELERATE = 2.0  # m/s^2
+
+
+def _prepare(scene: Scene) -> tuple[_Pairs, _Pairs]:
+    c = scene.conflicts
+    count = scene.s.shape[0]
+    itself = jnp.eye(count, dtype=bool)
+    itself = itself.reshape(itself.shape + (1,) * (scene.s.ndim - 1))
+    present = scene.active[None] & ~itself
+    zone = present & (c.begin < NO_GAP)
+    far = jnp.where(present, c.meets, _FAR)
+    group = _Pairs(
+        length=scene.length,
+        shift=c.shift,
+        far=far,
+        merges=(far > -NO_GAP) & (far < NO_GAP),
+        wide=(scene.width[:, None] + scene.width[None]) / 2,
+        begin=jnp.where(zone, c.begin, _FAR),
+        end=jnp.where(zone, c.end, _FAR),
+        window=(jnp.swapaxes(c.begin, 0, 1), jnp.swapaxes(c.end, 0, 1) + scene.length[None]),
+        crosses=zone & (far >= NO_GAP),
+        gives_way=zone & c.gives_way,
+        behind=0.5,
+    )
+    zone = scene.other_active[None] & (c.other_begin < NO_GAP)
+    others = _Pairs(
+        length=scene.other_length,
+        shift=jnp.zeros_like(c.other_begin),
+        far=jnp.where(c.other_beside & scene.other_active[None], -_FAR, _FAR),
+        merges=jnp.zeros_like(c.other_beside),
+        wide=(scene.width[:, None] + scene.other_width[None]) / 2,
+        begin=jnp.where(zone, c.other_begin, _FAR),
+        end=jnp.where(zone, c.other_end, _FAR),
+        window=(c.other_in, c.other_out),
+        crosses=zone,
+        gives_way=zone & c.gives_way_to_other,
+        behind=0.0,
+    )
+    return group, others
+
+
+def _most(x: Array) -> Array:
+    """Maximum over axis 1, as arithmetic on the axes behind: a reduction would not become vector code."""
+    return _fold(jnp.maximum, x)
+
+
+def _any(x: Array) -> Array:
+    return _fold(jnp.logical_or, x)
+
+
+def _fold(operator: Callable[[Array, Array], Array], x: Array) -> Array:
+    result = x[:, 0]
+    for k in range(1, x.shape[1]):
+        result = operator(result, x[:, k])
+    return result
+
+
+def _stop_of(scene: Scene, lane: Array) -> Array:
+    """Where to stop in a lane (a float); `[G]`, m."""
+    result = jnp.full_like(scene.s, NO_GAP)
+    for k in range(scene.stop.shape[1]):
+        result = jnp.where(jnp.abs(lane - k) < 0.5, scene.stop[:, k], result)
+    return result
+
+
+def _windows(pairs: _Pairs, motion: _Motion, time: Array) -> tuple[Array, Array]:
+    """When the other one enters and leaves the conflict, s from now; `[G, M]`."""
+    enters, leaves = pairs.window
+    if pairs.behind == 0:
+        return enters - time, leaves - time
+    pace = 1 / jnp.maximum(motion.v, _STARTING)[None]
+    return (enters - motion.s[None]) * pace, (leaves - motion.s[None]) * pace
+
+
+class _Ahead(NamedTuple):
+    """The most that anything ahead asks for; `[G]`."""
+
+    z: Array  # desired gap over gap
+    needed: Array  # m/s^2, braking
+    hold: Array  # m to a conflict that it may not enter
+
+
+def _look_ahead(
+    pairs: _Pairs, scene: Scene, motion: _Motion, bodies: _Bodies, yields: Array, time: Array
+) -> _Ahead:
+    driver, v, front = scene.driver, motion.v, motion.s[:, None]
+    goal = motion.aim * scene.lane_width
+    ahead = bodies.s[None] + pairs.shift
+    low, high = jnp.minimum(motion.y, goal)[:, None], jnp.maximum(motion.y, goal)[:, None]
+    reach = pairs.wide + _MARGIN_Y
+    leads = (ahead > pairs.far) & (ahead > front)
+    leads &= pairs.merges | ((bodies.y[None] > low - reach) & (bodies.y[None] < high + reach))
+    gap = jnp.where(leads, jnp.maximum(ahead - pairs.length[None] - front, _LEAST_GAP), NO_GAP)
+    per_gap = computed_once(1 / gap)
+    closing = v[:, None] - bodies.v[None]
+    wish = driver.s0[:, None] + jnp.maximum(
+        (v * driver.T)[:, None] + (v * _half(driver))[:, None] * closing, 0
+    )
+
+    to_begin = pairs.begin - front
+    pace = 1 / jnp.maximum(v, _STARTING)[:, None]
+    enters, leaves = _windows(pairs, motion, time)
+    mine_out = (pairs.end + (scene.length - motion.s)[:, None]) * pace
+    meets = (to_begin * pace < leaves + _MEETING) & (enters < mine_out + _MEETING)
+    can = to_begin > (0.5 * v * v / driver.b_max)[:, None]
+    minds = pairs.gives_way & yields[:, None] & meets & can
+    blocked = (leaves > 0) & (to_begin > 0) & (minds | (pairs.crosses & (enters < 0)))
+    hold = computed_once(jnp.where(blocked, -to_begin, -NO_GAP))
+    return _Ahead(
+        z=_most(wish * per_gap),
+        needed=_most(0.5 * jnp.square(jnp.maximum(closing, 0)) * per_gap),
+        hold=-_most(hold),
+    )
+
+
+def _half(driver: Driver) -> Array:
+    return 0.5 * lax.rsqrt(driver.a * driver.b)
+
+
+def _accelerate(
+    pairs: tuple[_Pairs, _Pairs],
+    scene: Scene,
+    motion: _Motion,
+    others: _Bodies,
+    yields: Array,
+    time: Array,
+) -> Array:
+    """IDM behind all who are on the way to the lane aimed at, and behind where to stop; m/s^2.
+
+    Where the IDM brakes harder than `b` plus what not to hit the leader takes if that keeps its speed,
+    this is enough, as it is for the ACC-IDM: short gaps after a cut-in are no emergency.
+    """
+    driver, v = scene.driver, motion.v
+    own = _Bodies(motion.s, motion.y, v)
+    near, far = computed_once(
+        [
+            _look_ahead(of, scene, motion, bodies, yields, time)
+            for of, bodies in zip(pairs, (own, others), strict=True)
+        ]
+    )
+    here = jnp.round(motion.y / scene.lane_width)
+    stop = jnp.minimum(_stop_of(scene, here), _stop_of(scene, motion.aim)) - motion.s
+    stand = jnp.maximum(jnp.minimum(jnp.minimum(near.hold, far.hold), stop), 0.1)
+    z = (driver.s0 + v * driver.T + v * v * _half(driver)) / stand
+    z = jnp.maximum(z, jnp.maximum(near.z, far.z))
+    needed = jnp.maximum(0.5 * v * v / stand, jnp.maximum(near.needed, far.needed))
+
+    free = jnp.exp(driver.delta * jnp.log(jnp.maximum(v / scene.v0, 1e-3)))
+    a = jnp.maximum(driver.a * (1 - free - z * z), -needed - driver.b)
+    return jnp.clip(a, -driver.b_max, driver.a)
+
+
+class _Contact(NamedTuple):
+    """What a vehicle did to its neighbours; `[G]`."""
+
+    loss: Array  # share of a collision
+    rude: Array  # in the way of one that goes first
+    pushed: Array  # how hard others must brake for it
+
+
+def _look_around(
+    pairs: _Pairs, scene: Scene, motion: _Motion, bodies: _Bodies, time: Array, dt: float
+) -> _Contact:
+    front, length = motion.s[:, None], scene.length[:, None]
+    place = bodies.s[None] + pairs.shift
+    ahead = place - front  # front to front
+    side = jnp.abs(bodies.y[None] - motion.y[:, None]) < pairs.wide + _MARGIN_Y
+    beside = (place > pairs.far) & jnp.where(pairs.merges, front > pairs.far, side)
+    overlap = (ahead - pairs.length[None] < _MARGIN_S) & (ahead + length > -_MARGIN_S)
+    enters, leaves = _windows(pairs, motion, time)
+    inside = (front > pairs.begin) & (front - length < pairs.end) & (leaves > 0)
+
+    # who has changed lanes, or was behind, or has to give way, loses most
+    start = scene.lane * scene.lane_width + scene.d
+    moved = (jnp.abs(motion.y - start) > _MOVED)[:, None]
+    before = ahead + (motion.v[:, None] - bodies.v[None]) * dt
+    share = jnp.where(moved | (before > 0), 1.0, pairs.behind)
+    loss = jnp.where(beside & overlap, share, 0)
+    met = inside & pairs.crosses & (enters < 0)
+    loss = jnp.maximum(loss, jnp.where(met, jnp.where(pairs.gives_way, 1.0, 0.5), 0))
+    rude = inside & pairs.gives_way & (enters < _MEETING)
+    loss, beside, rude = computed_once((loss, beside, rude))
+    if pairs.behind > 0:
+        pushed = jnp.zeros_like(motion.s)
+    else:
+        back = jnp.maximum(-ahead - length, _LEAST_GAP)
+        v = motion.v[:, None]
+        closing = jnp.maximum(bodies.v[None] - v, 0)
+        short = jnp.maximum(1 - back / (1 + 0.5 * v), 0)
+        pushed = _most(jnp.where(beside & moved & (ahead < 0), closing**2 / (8 * back) + short, 0))
+    return _Contact(loss=_most(loss), rude=_any(rude), pushed=pushed)
+
+
+def _drive(
+    settings: Settings,
+    pairs: tuple[_Pairs, _Pairs],
+    scene: Scene,
+    motion: _Motion,
+    score: _Score,
+    cap: Array,
+    yields: Array,
+    now: _Bodies,
+    then: _Bodies,
+    time: Array,
+) -> tuple[_Motion, _Score]:
+    """One sub-step: the group moves, others go from `now` to `then`; what it earns."""
+    dt, width = settings.dt, scene.lane_width
+    a = _accelerate(pairs, scene, motion, now, yields, time)
+    a = jnp.where(scene.active, jnp.minimum(a, cap), 0)
+    v, way = ballistic(motion.v, a, dt)
+    a = (v - motion.v) / dt
+    most = jnp.minimum(settings.lateral_speed, 0.35 * v) * dt
+    y = motion.y + jnp.clip(motion.aim * width - motion.y, -most, most)
+    after = _Motion(s=motion.s + way, v=v, a=a, y=y, aim=motion.aim)
+
+    own = _Bodies(after.s, y, v)
+    near, far = computed_once(
+        [
+            _look_around(of, scene, after, bodies, time + dt, dt)
+            for of, bodies in zip(pairs, (own, then), strict=True)
+        ]
+    )
+    place = y / width
+    passed = after.s > _stop_of(scene, jnp.round(place))
+    loss = jnp.maximum(jnp.maximum(near.loss, far.loss), jnp.where(passed, 1.0, 0))
+    off = jnp.maximum(jnp.maximum(scene.wanted_first - place, place - scene.wanted_last), 0)
+    room = off * (v / settings.lateral_speed * width + 12) + 40
+    left = scene.to_go - (after.s - scene.s)
+    urgency = jnp.clip(2 - left / room, 0.2, 1)
+
+    earned = settings.progress * jnp.clip(v / scene.v0, 0, 1) + (1 - settings.progress)
+    earned -= settings.lane * off * urgency
+    earned -= settings.comfort * jnp.square(a / 4) + settings.jerk * jnp.square((a - motion.a) / 4)
+    earned -= settings.push * jnp.minimum(far.pushed, 1)
+    earned -= jnp.where(near.rude | far.rude, settings.right_of_way, 0)
+    reward = score.reward + score.alive * (earned / settings.steps - settings.crash * loss)
+    alive = jnp.where(loss > 0, 0, score.alive)
+    return after, _Score(reward=reward, alive=alive)
+
+
+def _allowed(scene: Scene, motion: _Motion) -> tuple[Array, Array]:
+    """Whether it may aim farther left, and right; a change on its way is only turned back."""
+    offset = motion.aim * scene.lane_width - motion.y
+    left = (motion.aim + 1 <= scene.last_lane) & (offset < 0.5 * scene.lane_width)
+    right = (motion.aim - 1 >= scene.first_lane) & (offset > -0.5 * scene.lane_width)
+    return left, right
+
+
+def _decide(
+    settings: Settings, scene: Scene, motion: _Motion, score: _Score, action: Array
+) -> tuple[_Motion, _Score, Array, Array]:
+    """A decision begins: the new aim, what it costs, most acceleration, and who gives way."""
+    left, right = _allowed(scene, motion)
+    step = jnp.where((action == Meta.LEFT) & left, 1.0, jnp.where((action == Meta.RIGHT) & right, -1.0, 0.0))
+    reward = score.reward - score.alive * settings.change * jnp.abs(step)
+    cap = jnp.where(action == Meta.KEEP, 0.0, jnp.where(action == Meta.DECELERATE, -_DECELERATE, NO_GAP))
+    yields = action != Meta.ACCELERATE
+    return motion._replace(aim=motion.aim + step), score._replace(reward=reward), cap, yields
+
+
+def _start(scene: Scene) -> tuple[_Motion, _Score]:
+    y = scene.lane * scene.lane_width + scene.d
+    motion = _Motion(s=scene.s, v=scene.v, a=scene.a, y=y, aim=scene.aim)
+    return motion, _Score(reward=jnp.zeros_like(y), alive=jnp.ones_like(y))
+
+
+def _moments(settings: Settings, scene: Scene) -> _Bodies:
+    """Predictions by decision and the moments within it, `[D, substeps + 1, K]`."""
+
+    def windows(x: Array) -> Array:
+        x = jnp.moveaxis(x, 1, 0)
+        n = settings.substeps
+        return jnp.stack([x[k * n : (k + 1) * n + 1] for k in range(settings.decisions)])
+
+    return _Bodies(windows(scene.other_s), windows(scene.other_y), windows(scene.other_v))
+
+
+def _decision(
+    settings: Settings,
+    pairs: tuple[_Pairs, _Pairs],
+    scene: Scene,
+    motion: _Motion,
+    score: _Score,
+    action: Array,
+    others: _Bodies,
+    depth: Array,
+) -> tuple[_Motion, _Score, list[_Motion]]:
+    """Drive on to the next decision."""
+    motion, score, cap, yields = _decide(settings, scene, motion, score, action)
+    passed = []
+    for k in range(settings.substeps):
+        now, then = (_Bodies(*(x[n] for x in others)) for n in (k, k + 1))
+        time = (depth * settings.substeps + k).astype(motion.s.dtype) * settings.dt
+        motion, score = _drive(settings, pairs, scene, motion, score, cap, yields, now, then, time)
+        passed.append(motion)
+    return motion, score, passed
+
+
+def _utility(scene: Scene, reward: Array) -> Array:
+    """Own reward and that of the rest of the group, mixed by the social value orientation; `[G]`."""
+    mine = jnp.where(scene.active, reward, 0)
+    rest = jnp.where(scene.active, 1.0, 0.0).sum(0)[None] - 1
+    mean = (mine.sum(0)[None] - mine) / jnp.maximum(rest, 1)
+    svo = scene.driver.svo
+    return jnp.where(rest > 0, jnp.cos(svo) * reward + jnp.sin(svo) * mean, reward)
+
+
+def _play(settings: Settings, scene: Scene, actions: Array) -> Plan:
+    pairs = _prepare(scene)
+    motion, score = first, _ = _start(scene)
+    xs = _moments(settings, scene), jnp.arange(settings.decisions), jnp.moveaxis(actions, 1, 0)
+
+    def decision(
+        carry: tuple[_Motion, _Score], x: tuple[_Bodies, Array, Array]
+    ) -> tuple[tuple[_Motion, _Score], _Motion]:
+        others, depth, action = x
+        motion, score, passed = _decision(settings, pairs, scene, *carry, action, others, depth)
+        return (motion, score), jax.tree.map(lambda *of: jnp.stack(of), *passed)
+
+    (motion, score), passed = lax.scan(decision, (motion, score), xs)
+
+    def over_time(start: Array, later: Array) -> Array:
+        rows = jnp.concatenate([start[None], later.reshape(-1, *start.shape)])
+        return jnp.moveaxis(rows, 0, 1)
+
+    path = jax.tree.map(over_time, first, passed)
+    return Plan(
+        action=jnp.where(actions < 0, Meta.ACCELERATE, actions),
+        value=_utility(scene, score.reward),
+        reward=score.reward,
+        crashed=(score.alive == 0) & scene.active,
+        visits=jnp.zeros((scene.s.shape[0], ACTIONS, *scene.s.shape[1:]), scene.s.dtype),
+        s=path.s,
+        y=path.y,
+        v=path.v,
+        aim=path.aim,
+    )
+
+
+# ---- the tree
+
+
+class _Tree(NamedTuple):
+    """Nodes 0..simulations; node 0 is the root, and simulation n may add node n + 1."""
+
+    link: Array  # [nodes] parent times ACTIONS^G plus joint action, -1 where there is no node
+    visits: Array  # [nodes, G, ACTIONS]
+    total: Array  # [nodes, G, ACTIONS], sum of utilities
+    low: Array  # [G], least utility seen
+    high: Array  # [G]
+    tried: Array  # [simulations, D, G] actions, -1 for the default policy
+    worth: Array  # [simulations]
+
+
+def _row(table: Array, row: Array) -> Array:
+    """`table[row]` for a table with a batch behind and a row for each of it."""
+    rest = table.shape[1:]
+    size = table[0].size
+    row = row.reshape((1,) * (len(rest) - row.ndim) + row.shape)
+    place = row * size + jnp.arange(size, dtype=row.dtype).reshape(rest)
+    return table.reshape(-1).at[place].get(mode="promise_in_bounds")
+
+
+def _child(tree: _Tree, link: Array) -> Array:
+    """Node at the end of a link, -1 for none."""
+    nodes = jnp.arange(tree.link.shape[0], dtype=jnp.int32)
+    nodes = nodes.reshape((-1,) + (1,) * link.ndim)
+    return jnp.max(jnp.where(tree.link == link[None], nodes, -1), 0)
+
+
+def _code(action: Array) -> Array:
+    code = action[0]
+    for k in range(1, action.shape[0]):
+        code = code * ACTIONS + action[k]
+    return code
+
+
+def _best(score: Array) -> Array:
+    """Index of the maximum over axis 1; `[G]`."""
+    best, index = score[:, 0], jnp.zeros(score[:, 0].shape, jnp.int32)
+    for k in range(1, score.shape[1]):
+        index = jnp.where(score[:, k] > best, k, index)
+        best = jnp.maximum(best, score[:, k])
+    return index
+
+
+def _ucb(settings: Settings, tree: _Tree, node: Array, allowed: Array, order: Array) -> Array:
+    """Action of each vehicle by UCB1 on utilities scaled to 0..1; `[G]`."""
+    row = jnp.maximum(node, 0)
+    visits, total = _row(tree.visits, row), _row(tree.total, row)
+    count = jnp.maximum(visits, 1)
+    known = total / count - tree.low[:, None]
+    known = known / jnp.maximum(tree.high - tree.low, 1e-3)[:, None]
+    tries = _fold(jnp.add, visits)[:, None]
+    score = known + settings.exploration * jnp.sqrt(jnp.log(jnp.maximum(tries, 1)) / count)
+    score = jnp.where(visits > 0, score + 1e-4 * order, 100 + order)
+    return _best(jnp.where(allowed, score, -NO_GAP))
+
+
+def _options(scene: Scene, motion: _Motion) -> Array:
+    """Actions that make sense, `[G, ACTIONS]`; of an empty slot only KEEP."""
+    left, right = _allowed(scene, motion)
+    always = jnp.ones_like(scene.active)
+    return jnp.stack([always, scene.active, scene.active, left & scene.active, right & scene.active], 1)
+
+
+def _search(settings: Settings, scene: Scene, previous: Array, noise: Array) -> Plan:
+    count, depth = scene.s.shape[0], settings.decisions
+    batch = scene.s.shape[1:]
+    pairs, others = _prepare(scene), _moments(settings, scene)
+    plan = jnp.moveaxis(previous, 1, 0)
+    depths = jnp.arange(depth)
+    joint: int = ACTIONS**count
+    # fractions of multiples of an irrational number are spread evenly: an order for each simulation
+    stride = 0.38196601 + 0.1 * noise
+
+    def simulate(n: Array, tree: _Tree) -> _Tree:
+        def decision(
+            carry: tuple[_Motion, _Score, Array, Array], x: tuple[_Bodies, Array, Array]
+        ) -> tuple[tuple[_Motion, _Score, Array, Array], tuple[Array, Array]]:
+            motion, score, node, new = carry
+            others, k, planned = x
+            order = noise + stride * (n + 3 * k).astype(noise.dtype)
+            order = order - jnp.floor(order)
+            options = _options(scene, motion)
+            chosen = _ucb(settings, tree, node, options, order)
+            planned = jnp.where((n < depth) & scene.active, planned, -1)
+            action = computed_once(jnp.where(planned >= 0, planned, chosen))
+            inside = node >= 0
+            link = node * joint + _code(action)
+            child = jnp.where(inside & (k < depth - 1), _child(tree, link), -1)
+            new = jnp.where(inside & (child < 0) & (k < depth - 1), link, new)
+            action = jnp.where(inside[None], action, -1)
+            motion, score, _ = _decision(settings, pairs, scene, motion, score, action, others, k)
+            return (motion, score, child, new), (node, action)
+
+        root = jnp.zeros(batch, jnp.int32)
+        start = (*_start(scene), root, root - 1)
+        (_, score, _, new), (path, taken) = lax.scan(decision, start, (others, depths, plan))
+        utility = _utility(scene, score.reward)
+
+        nodes = jnp.arange(settings.simulations + 1, dtype=jnp.int32).reshape((-1, 1, 1) + (1,) * len(batch))
+        arms = jnp.arange(ACTIONS, dtype=jnp.int32).reshape((1, 1, -1) + (1,) * len(batch))
+        hits = jnp.zeros_like(tree.visits)
+        for k in range(depth):
+            hit = (nodes == path[k][None, None, None]) & (arms == taken[k][None, :, None])
+            hits += jnp.where(hit, 1.0, 0.0)
+        return _Tree(
+            link=lax.dynamic_update_index_in_dim(tree.link, new, n + 1, 0),
+            visits=tree.visits + hits,
+            total=tree.total + hits * utility[None, :, None],
+            low=jnp.minimum(tree.low, utility),
+            high=jnp.maximum(tree.high, utility),
+            tried=lax.dynamic_update_index_in_dim(tree.tried, taken, n, 0),
+            worth=lax.dynamic_update_index_in_dim(tree.worth, _worth(scene, score, utility), n, 0),
+        )
+
+    shape = (settings.simulations + 1, count, ACTIONS, *batch)
+    empty = _Tree(
+        link=jnp.full((settings.simulations + 1, *batch), -1, jnp.int32),
+        visits=jnp.zeros(shape, scene.s.dtype),
+        total=jnp.zeros(shape, scene.s.dtype),
+        low=jnp.full(scene.s.shape, NO_GAP, scene.s.dtype),
+        high=jnp.full(scene.s.shape, -NO_GAP, scene.s.dtype),
+        tried=jnp.zeros((settings.simulations, depth, count, *batch), jnp.int32),
+        worth=jnp.zeros((settings.simulations, *batch), scene.s.dtype),
+    )
+    tree: _Tree = lax.fori_loop(0, settings.simulations, simulate, empty)
+
+    # what each would rather do, as far as it has been seen to go well together
+    favour = tree.worth
+    for k in range(ACTIONS):
+        share = tree.visits[0, :, k] / settings.simulations
+        favour += jnp.sum(jnp.where(tree.tried[:, 0] == k, share[None], 0), 1)
+    best = jnp.argmax(favour, 0).astype(jnp.int32)
+    actions = jnp.moveaxis(_row(tree.tried, best), 0, 1)
+    return _play(settings, scene, actions)._replace(visits=tree.visits[0])
+
+
+_SEEN = 1.0  # weight of the utilities of a plan, next to the share of visits of its first actions
+
+
+def _worth(scene: Scene, score: _Score, utility: Array) -> Array:
+    """What a simulation is worth next to the share of visits of its first actions.
+
+    Plans without collisions go first. Who is alone knows what he gets, and takes the best that he saw.
+    """
+    crashed = jnp.where((score.alive == 0) & scene.active, 1.0, 0.0).sum(0)
+    alone = scene.active.sum(0) == 1
+    return jnp.where(alone, 1e3, _SEEN) * jnp.where(scene.active, utility, 0).sum(0) - crashed
+
+
+__all__ = [
+    "ACTIONS",
+    "Conflicts",
+    "Plan",
+    "Scene",
+    "Settings",
+    "no_conflicts",
+    "no_plan",
+    "play",
+    "search",
+    "shifted",
+]
