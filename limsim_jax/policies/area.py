@@ -144,7 +144,7 @@ class AreaOfInterest:
         fit &= stays | ((state.side == 0) & (state.s > state.shape.length))
         leave = 1.3 * self.radius if self.leave is None else self.leave
         near = (away < self.radius) | (stays & (away < leave)) | young
-        relevance = jnp.exp(-away / 30.0) + 0.5 * stays + jnp.where(young, 10.0, 0.0)
+        relevance = jnp.exp(-away / 30.0) + jnp.where(stays, 0.5, 0.0) + jnp.where(young, 10.0, 0.0)
         relevance = jnp.where(fit & near, relevance, -1.0)
         best, who = lax.top_k(relevance, min(self.slots, number))
         chosen = ((jnp.arange(number)[:, None] == who[None]) & (best > 0)[None]).any(-1)
@@ -153,7 +153,7 @@ class AreaOfInterest:
         new = chosen & ~(has & keeps[None]).any(-1)
         order = lax.top_k(jnp.where(new, relevance, -1.0), min(self.slots, number))
         arrivals = jnp.where(order[0] > 0, order[1], -1)
-        rank = jnp.cumsum(~keeps) - 1
+        rank = jnp.cumsum(~keeps, dtype=jnp.int32) - 1
         arrivals = jnp.pad(arrivals, (0, max(0, self.slots - number)), constant_values=-1)
         slot = jnp.where(keeps, memory.slot, arrivals[jnp.clip(rank, 0, self.slots - 1)]).astype(
             memory.slot.dtype

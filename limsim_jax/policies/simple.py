@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from limsim_jax.maps.lane_map import LaneMap, pose
-from limsim_jax.traffic.ego import Control
-from limsim_jax.traffic.engine import Command
+from limsim_jax.policies.perception import rules
+from limsim_jax.policies.reference import body_lane, place_on, way_ahead
+from limsim_jax.traffic.ego import Control, Trajectory
+from limsim_jax.traffic.engine import Command, Traffic
+from limsim_jax.traffic.motion import accelerations
 from limsim_jax.types import Config, State
 
 
@@ -68,3 +71,45 @@ class ConstantSpeed:
         steering = jnp.arctan(wheelbase * bend)
         wish = (memory - v) / config.decision_time
         return Command(control=Control(acceleration=wish, steering=steering)), memory
+
+
+@dataclass(frozen=True)
+class FollowLane:
+    """Drives in the plane what traffic drives on its lane: car following, right of way, no lane changes.
+
+    For comparisons: whatever differs from `LikeTraffic` comes from moving in the plane.
+
+    Attributes:
+      others: vehicles of the traffic that it can drive beside the egos.
+      traffic: rules of the road, and how drivers follow each other.
+    """
+
+    others: int = 0
+    traffic: Traffic = field(default_factory=Traffic)
+
+    free = True
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """Nothing to remember."""
+        del config, lane_map, state
+
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
+    ) -> tuple[Command, Any]:
+        """The acceleration of the traffic model, held along the middle of the lane for two seconds."""
+        del key
+        slot = state.egos.slot
+        _, decision = rules(config, self.traffic, lane_map, state, jnp.zeros_like(slot))
+        a = accelerations(self.traffic.model, state, decision, jnp.zeros_like(state.s))[slot][:, None]
+        lane, s = body_lane(lane_map, state, slot)
+        way = way_ahead(lane_map, lane, s, state.goal[slot], points=45, step=2.0)
+        times = 0.2 * jnp.arange(11, dtype=jnp.float32)[None]
+        v0, d0 = state.v[slot][:, None], state.d[slot][:, None]
+        stops = jnp.where(a < 0, v0 / jnp.maximum(-a, 1e-3), 1e3)
+        t = jnp.minimum(times, stops)
+        along = v0 * t + a * t * t / 2
+        place = place_on(way, along, d0 * jnp.exp(-along / 10.0))
+        trajectory = Trajectory(
+            x=place.x, y=place.y, heading=place.heading, v=v0 + a * t, t0=config.time(state.step), dt=0.2
+        )
+        return Command(trajectory=trajectory), memory

@@ -14,11 +14,12 @@ from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.limsim_tm.decide import Told, grouped, neighbours, tell
 from limsim_jax.policies.limsim_tm.plan import Lattice, Merge, Others, Task, plan, room_needed
 from limsim_jax.policies.limsim_tm.search import Settings, no_plan, shifted
+from limsim_jax.policies.perception import Around, around, rules
 from limsim_jax.policies.predict import Prediction, constant_velocity
 from limsim_jax.policies.reference import Way, beside, body_lane, motion_on, way_ahead
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.ego import Trajectory, at_slots
-from limsim_jax.traffic.engine import Command, Decision, Traffic, decide
+from limsim_jax.traffic.engine import Command, Decision, Traffic
 from limsim_jax.traffic.lane_change import urgency
 from limsim_jax.types import Config, State
 
@@ -30,18 +31,6 @@ class Memory(NamedTuple):
     side: Int[Array, " E"]  # lane change under way: 1 left, -1 right, 0 none
     told: Told  # by the last search
     since: Float[Array, " E"]  # s, time of that search
-
-
-class Around(NamedTuple):
-    """The `K` others that matter to each of `V` vehicles, as seen from its way."""
-
-    slot: Int[Array, "V K"]
-    there: Bool[Array, "V K"]
-    s: Float[Array, "V K"]  # m from centre to centre along the way
-    d: Float[Array, "V K"]  # m off the way
-    gap: Float[Array, "V K"]  # m between bumpers; positive ahead of us and behind us alike
-    v: Float[Array, "V K"]  # m/s along the way
-    on_way: Bool[Array, "V K"]  # its body is on the lane that the way follows
 
 
 @dataclass(frozen=True)
@@ -260,56 +249,4 @@ class LimSimTM:
 
 _POINTS, _STEP = 80, 2.0  # of a way, m
 _ANY_SPEED = 1e3  # m/s, where nobody has searched yet
-_NEXT_LANE = 5.0  # m off the way, from which somebody may be changing to it
 _HARD = 4.0  # m/s^2, the hardest braking that a lane change may ask of anybody; then it is given up
-
-
-def rules(
-    config: Config, traffic: Traffic, lane_map: LaneMap, state: State, side: Int[Array, " E"]
-) -> tuple[Int[Array, " E"], Decision]:
-    """What the traffic engine sees: leaders, right of way, lights, ends of lanes; and lane changes by MOBIL.
-
-    `side`: lane changes that egos are in the midst of. Returns the lane changes that would begin now.
-    """
-    egos = replace(state.egos, free=jnp.zeros_like(state.egos.free))
-    now = at_slots(egos, side, state.side, side != 0)
-    before = replace(state, egos=egos, side=now)
-    after, decision = decide(config, traffic, lane_map, before, Command())
-    return jnp.where(now[egos.slot] == 0, after.side[egos.slot], 0), decision
-
-
-def around(state: State, prediction: Prediction, way: Way, slot: Int[Array, " V"], count: int) -> Around:
-    """The others that come nearest within the next seconds, and where they are on the way."""
-    number = state.lane.shape[0]
-    x, y = prediction.x, prediction.y  # [N H]
-    mine = jnp.arange(number)[None] == slot[:, None]
-    picks = (0, x.shape[1] // 3, 2 * x.shape[1] // 3)
-    away = jnp.stack(
-        [
-            (x[:, k][None] - x[slot, k][:, None]) ** 2 + (y[:, k][None] - y[slot, k][:, None]) ** 2
-            for k in picks
-        ]
-    )
-    away = jnp.where(mine | ~state.active[None], 1e12, away.min(0))
-    near, index = lax.top_k(-away, min(count, number))
-    there = near > -1e11
-    ox, oy = x[index, 0], y[index, 0]
-    # the nearest point of the way
-    far = (ox[..., None] - way.x[:, None]) ** 2 + (oy[..., None] - way.y[:, None]) ** 2  # [V K M]
-    k = jnp.argmin(far, -1)
-    at = lambda table: jnp.take_along_axis(table, k, 1)  # noqa: E731
-    cos, sin = jnp.cos(at(way.heading)), jnp.sin(at(way.heading))
-    dx, dy = ox - at(way.x), oy - at(way.y)
-    s, d = k.astype(dx.dtype) * way.step + dx * cos + dy * sin, -dx * sin + dy * cos
-    turned = prediction.heading[index, 0] - at(way.heading)
-    half = (
-        jnp.abs(jnp.cos(turned)) * state.shape.width[index]
-        + jnp.abs(jnp.sin(turned)) * state.shape.length[index]
-    )
-    on_way = (
-        there & (jnp.abs(d) < half / 2 + state.shape.width[slot][:, None] / 2 + 0.1) & (jnp.cos(turned) > 0.3)
-    )
-    joins = there & (state.side[index] * jnp.sign(d).astype(jnp.int32) < 0) & (jnp.abs(d) < _NEXT_LANE)
-    on_way = (on_way | joins) & (jnp.abs(s) < way.reach)
-    lengths = (state.shape.length[index] + state.shape.length[slot][:, None]) / 2
-    return Around(index, there, s, d, jnp.abs(s) - lengths, state.v[index] * jnp.cos(turned), on_way)

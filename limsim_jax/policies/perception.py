@@ -1,0 +1,82 @@
+"""What planners see: the rules of the road as the traffic engine knows them, and the others around."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.policies.predict import Prediction
+from limsim_jax.policies.reference import Way
+from limsim_jax.traffic.ego import at_slots
+from limsim_jax.traffic.engine import Command, Decision, Traffic, decide
+from limsim_jax.types import Config, State
+
+_NEXT_LANE = 5.0  # m off the way, from which somebody may be changing to it
+
+
+class Around(NamedTuple):
+    """The `K` others that matter to each of `V` vehicles, as seen from its way."""
+
+    slot: Int[Array, "V K"]
+    there: Bool[Array, "V K"]
+    s: Float[Array, "V K"]  # m from centre to centre along the way
+    d: Float[Array, "V K"]  # m off the way
+    gap: Float[Array, "V K"]  # m between bumpers; positive ahead of us and behind us alike
+    v: Float[Array, "V K"]  # m/s along the way
+    on_way: Bool[Array, "V K"]  # its body is on the lane that the way follows
+
+
+def rules(
+    config: Config, traffic: Traffic, lane_map: LaneMap, state: State, side: Int[Array, " E"]
+) -> tuple[Int[Array, " E"], Decision]:
+    """What the traffic engine sees: leaders, right of way, lights, ends of lanes; and lane changes by MOBIL.
+
+    `side`: lane changes that egos are in the midst of. Returns the lane changes that would begin now.
+    """
+    egos = replace(state.egos, free=jnp.zeros_like(state.egos.free))
+    now = at_slots(egos, side, state.side, side != 0)
+    before = replace(state, egos=egos, side=now)
+    after, decision = decide(config, traffic, lane_map, before, Command())
+    return jnp.where(now[egos.slot] == 0, after.side[egos.slot], 0), decision
+
+
+def around(state: State, prediction: Prediction, way: Way, slot: Int[Array, " V"], count: int) -> Around:
+    """The others that come nearest within the next seconds, and where they are on the way."""
+    number = state.lane.shape[0]
+    x, y = prediction.x, prediction.y  # [N H]
+    mine = jnp.arange(number)[None] == slot[:, None]
+    picks = (0, x.shape[1] // 3, 2 * x.shape[1] // 3)
+    away = jnp.stack(
+        [
+            (x[:, k][None] - x[slot, k][:, None]) ** 2 + (y[:, k][None] - y[slot, k][:, None]) ** 2
+            for k in picks
+        ]
+    )
+    away = jnp.where(mine | ~state.active[None], 1e12, away.min(0))
+    near, index = lax.top_k(-away, min(count, number))
+    there = near > -1e11
+    ox, oy = x[index, 0], y[index, 0]
+    # the nearest point of the way
+    far = (ox[..., None] - way.x[:, None]) ** 2 + (oy[..., None] - way.y[:, None]) ** 2  # [V K M]
+    k = jnp.argmin(far, -1)
+    at = lambda table: jnp.take_along_axis(table, k, 1)  # noqa: E731
+    cos, sin = jnp.cos(at(way.heading)), jnp.sin(at(way.heading))
+    dx, dy = ox - at(way.x), oy - at(way.y)
+    s, d = k.astype(dx.dtype) * way.step + dx * cos + dy * sin, -dx * sin + dy * cos
+    turned = prediction.heading[index, 0] - at(way.heading)
+    half = (
+        jnp.abs(jnp.cos(turned)) * state.shape.width[index]
+        + jnp.abs(jnp.sin(turned)) * state.shape.length[index]
+    )
+    on_way = (
+        there & (jnp.abs(d) < half / 2 + state.shape.width[slot][:, None] / 2 + 0.1) & (jnp.cos(turned) > 0.3)
+    )
+    joins = there & (state.side[index] * jnp.sign(d).astype(jnp.int32) < 0) & (jnp.abs(d) < _NEXT_LANE)
+    on_way = (on_way | joins) & (jnp.abs(s) < way.reach)
+    lengths = (state.shape.length[index] + state.shape.length[slot][:, None]) / 2
+    return Around(index, there, s, d, jnp.abs(s) - lengths, state.v[index] * jnp.cos(turned), on_way)
