@@ -143,6 +143,7 @@ _RSS_UNTIL = 1.5  # s; later there will be another plan
 _APPROACH = 0.6  # of the comfortable deceleration: slows down for bends and limits ahead
 _STOPPING, _STOPPING_LATE = 0.8, 1.5  # of it: stops at lines, and at the end of a lane that it has to leave
 _MERGE_BRAKING = 2.0  # m/s^2
+_HURRY = 2.5  # times the weight of efficiency
 _MIN_LATERAL = 10.0  # m, least distance in which the offset changes
 
 
@@ -365,8 +366,10 @@ def _costs(
     dynamic = each(driver.T)[..., None] + approach / (2 * jnp.sqrt(each(driver.a * driver.b)))[..., None]
     wanted = each(driver.s0)[..., None] + jnp.maximum(v[..., None] * dynamic, 0)
     close = jnp.maximum(1 - gap / wanted, 0).max(-1)
+    # who joins others is best as fast as they are
+    hurry = jnp.where(task.merge.urgency > 0, _HURRY, 1.0)[:, None]
     cost = (
-        lattice.efficiency * jnp.mean(slow, -1)
+        lattice.efficiency * hurry * jnp.mean(slow, -1)
         + lattice.speeding * jnp.mean(over * over, -1)
         + lattice.acceleration * jnp.mean(a * a, -1)
         + lattice.jerk * jnp.mean(jerk * jerk, -1)
@@ -409,7 +412,7 @@ def room_needed(
     v: Float[Array, "*#b"],
     v_ahead: Float[Array, "*#b"],
     braking: Float[Array, "*#b"] | float,
-    headway: float = 0.3,
+    headway: Float[Array, "*#b"] | float = 0.3,
 ) -> Float[Array, "*#b"]:
     """Gap, m, that a lane change must leave between somebody at `v` and somebody ahead at `v_ahead`, m/s.
 

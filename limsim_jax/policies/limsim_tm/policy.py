@@ -21,6 +21,7 @@ from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.ego import Trajectory, at_slots
 from limsim_jax.traffic.engine import Command, Decision, Traffic
 from limsim_jax.traffic.lane_change import urgency
+from limsim_jax.traffic.motion import CREEP_SPEED
 from limsim_jax.types import Config, State
 
 
@@ -49,7 +50,7 @@ class LimSimTM:
 
     others: int = 0
     nearest: int = 8
-    search: Settings | None = field(default_factory=lambda: Settings(simulations=40))
+    search: Settings | None = field(default_factory=lambda: Settings(simulations=40, change=0.08))
     search_every: int = 3
     obedience: float = 0.985
     lattice: Lattice = field(default_factory=Lattice)
@@ -78,7 +79,8 @@ class LimSimTM:
         drives = (slot >= 0) & state.active[slot]
         same = memory.slot == slot
         side = jnp.where(same, memory.side, 0)
-        wish, decision = rules(config, self.traffic, lane_map, state, side)
+        rule, decision = rules(config, self.traffic, lane_map, state, side)
+        wish = rule
         lane, s = body_lane(lane_map, state, slot)
         d, goal = state.d[slot], state.goal[slot]
 
@@ -108,8 +110,13 @@ class LimSimTM:
         begins = (side == 0) & (jnp.abs(d) < 0.6) & self._may_change(lane_map, state, slot, lane, look)
         # changes to the left and to the right begin in turns, as in all traffic
         begins &= look == jnp.where((state.step // config.decision_every) % 2 == 0, 1, -1)
-        most = jnp.where(need * look > 0, 2.5 + 2.0 * press, 2.0)
-        begins &= ((wish == look) | (need * look > 0)) & self._fits(state, slot, traffic, most)
+        most = jnp.where(need * look > 0, 2.5 + 2.5 * press, 2.0)
+        fits = self._fits(state, slot, traffic, most, 0.3 - 0.2 * press)
+        # nobody changes lanes for speed alone shortly before a junction
+        v = jnp.maximum(state.v[slot], CREEP_SPEED)
+        to_junction = lane_map.length[lane] - s - v * state.driver.lane_change_time[slot] - _BEFORE_JUNCTION
+        fits &= (need * look > 0) | (to_junction > 0) | ~lane_map.is_connector[own.lane].any(-1)
+        begins &= ((wish == look) | (need * look > 0)) & fits | ((rule == look) & (need * rule > 0))
         goes_on = (side != 0) & self._fits(state, slot, traffic, _HARD, 0.0)
         side = jnp.where(there & (begins | goes_on), look, 0)
         changes = side != 0
@@ -189,10 +196,12 @@ class LimSimTM:
         slot: Int[Array, " V"],
         found: Around,
         most: Float[Array, " V"] | float,
-        headway: float = 0.3,
+        headway: Float[Array, " V"] | float = 0.3,
     ) -> Bool[Array, " V"]:
         """Whether there is room on the way: nobody beside, nobody has to brake harder than `most` m/s^2."""
-        most = jnp.broadcast_to(jnp.asarray(most, found.v.dtype), slot.shape)[:, None]
+        most, headway = (
+            jnp.broadcast_to(jnp.asarray(x, found.v.dtype), slot.shape)[:, None] for x in (most, headway)
+        )
         v = state.v[slot][:, None]
         ahead, other = found.s > 0, jnp.maximum(found.v, 0)
         need = room_needed(jnp.where(ahead, v, other), jnp.where(ahead, other, v), most, headway)
@@ -248,5 +257,6 @@ class LimSimTM:
 
 
 _POINTS, _STEP = 80, 2.0  # of a way, m
+_BEFORE_JUNCTION = 30.0  # m
 _ANY_SPEED = 1e3  # m/s, where nobody has searched yet
 _HARD = 4.0  # m/s^2, the hardest braking that a lane change may ask of anybody; then it is given up
