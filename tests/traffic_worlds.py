@@ -11,7 +11,7 @@ from limsim_jax.maps import build_lane_map, bundled_map, load_map
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import Network
 from limsim_jax.traffic.demand import start_state
-from limsim_jax.types import Driver, Shape, State
+from limsim_jax.types import Driver, Schedule, Shape, State
 
 
 @functools.cache
@@ -68,3 +68,12 @@ def scattered(name: str, n: int, seed: int, spacing: float = 30.0, v: float = 15
     return state_of(
         name, [row for row, _ in pick], np.array([s for _, s in pick]) + jitter, np.full(len(pick), v), goal
     )
+
+
+def no_arrivals(state: State) -> Schedule:
+    """A schedule by which nobody enters the world of this state."""
+    zero = jnp.zeros(1, jnp.int32)
+    return Schedule(
+        time=jnp.full(1, 1e9), lane=zero - 1, s=jnp.zeros(1), v=jnp.zeros(1), goal=zero,
+        driver=drivers(1), shape=shapes(1), start=jnp.zeros(1 + state.queues.next.shape[0], jnp.int32),
+    )  # fmt: skip

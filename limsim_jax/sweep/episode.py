@@ -23,6 +23,7 @@ from limsim_jax.maps import build_lane_map, bundled_maps, load_map
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import MapError, Network
 from limsim_jax.maps.routing import default_goals
+from limsim_jax.maps.xml import file_hash
 from limsim_jax.metrics.blame import Responsibility
 from limsim_jax.metrics.episode import NAMES
 from limsim_jax.metrics.observer import EvaluateEgo
@@ -46,7 +47,14 @@ from limsim_jax.sweep.store import Outcome
 from limsim_jax.traffic import car_following
 from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand, entries, sample_scenario
 from limsim_jax.traffic.engine import Command, Traffic
-from limsim_jax.traffic.vehicles import default_population, fitting, sample_vehicles, uniform_population
+from limsim_jax.traffic.population_file import read_population
+from limsim_jax.traffic.vehicles import (
+    URBAN,
+    default_population,
+    fitting,
+    sample_vehicles,
+    uniform_population,
+)
 from limsim_jax.types import Config, Scenario, State
 
 HARD = 3.4
@@ -164,7 +172,9 @@ class Episodes:
     def provenance(self) -> dict[str, Any]:
         """Where the rows come from."""
         device = jax.local_devices()[0]
+        drivers = self.experiment.traffic.drivers
         return {
+            **({"drivers": file_hash(Path(drivers).read_bytes())} if drivers is not None else {}),
             "experiment": self.experiment.model_dump(mode="json", exclude={"map"}),
             "map": {"file": os.path.basename(self.network.source), "hash": self.network.file_hash},
             "map_file": self._map_file(),
@@ -416,7 +426,9 @@ def _demand(
             fields: dict[str, Any] = flow.model_dump() | {"origin": origin}
             flows.append(Flow(**fields))
     try:
-        population = default_population(traffic.mix) if traffic.mix is not None else default_population()
+        shares = URBAN if traffic.mix is None else traffic.mix
+        drivers = traffic.drivers
+        population = default_population(shares) if drivers is None else read_population(drivers, shares)
         population = fitting(population, lane_map)
         return build_demand(
             network, lane_map, goals, flows, population, horizon=experiment.horizon, density=traffic.density,

@@ -61,6 +61,8 @@ class TrafficTable(_Table):
     flow: list[Flow] = Field(default_factory=list)
     mix: dict[str, NotNegative] | None = None
     """Shares of vehicle classes."""
+    drivers: str | None = None
+    """A file of drivers that `limsim-jax calibrate` wrote, seen from the experiment file."""
     model: Literal["idm", "iidm", "acc"] = "acc"
     lane_changes: bool = True
     after_collision: AfterCollision = "stop"
@@ -199,6 +201,11 @@ def _experiment(found: Mapping[str, Any], path: Path, map_file: str | None, poli
         found["map"] = map_file
     elif isinstance(found.get("map"), str) and (path.parent / found["map"]).exists():
         found["map"] = str(path.parent / found["map"])
+    traffic = found.get("traffic")
+    if isinstance(traffic, dict) and isinstance(traffic.get("drivers"), str):
+        drivers = path.parent / traffic["drivers"]
+        if drivers.exists():
+            found["traffic"] = traffic | {"drivers": str(drivers.resolve())}
     if policy is not None:
         ego: dict[str, Any] = dict(found.get("ego", {}))
         ego.pop("options", None)

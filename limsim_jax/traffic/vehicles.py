@@ -20,6 +20,7 @@ import numpy as np
 from flax import struct
 from jax.lax import erf, erf_inv
 from jaxtyping import Array, Float, Int, Key
+from numpy.typing import NDArray
 
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES, LaneMap
 from limsim_jax.maps.network import MapError
@@ -51,6 +52,9 @@ class Population:
     loading: Float[Array, "Y P"]  # -1..1, correlation with aggressiveness (of bodies: size)
     lower: Float[Array, "Y P"]
     upper: Float[Array, "Y P"]
+    factor: Float[Array, "Y P P"] | None = None
+    """Lower triangular root of the correlation of what `loading` leaves of the scores; None: of no
+    correlation."""
 
 
 def sample(
@@ -81,6 +85,8 @@ def sample(
             population.upper,
         )
     )
+    if population.factor is not None:
+        own = population.factor[vehicle_type] @ own
     score = loading * latent[_LATENT] + jnp.sqrt(1 - loading * loading) * own
 
     def scale(x: Array) -> Array:
@@ -390,6 +396,40 @@ def fitting(population: Population, lane_map: LaneMap) -> Population:
     return replace(population, share=jnp.asarray(share, jnp.float32))
 
 
+def refit(
+    population: Population,
+    classes: Sequence[str],
+    rows: Mapping[str, tuple[float, float, float, float]],
+    factor: NDArray[np.float64],
+) -> Population:
+    """A population some parameters of which have another, joint distribution, see `population_file`.
+
+    Args:
+      population: one type per class.
+      classes: whom it concerns.
+      rows: median, spread, lower and upper bound per parameter.
+      factor: lower triangular root of the correlation of their scores, in the order of `rows`.
+    """
+    types = np.isin(np.asarray(population.vehicle_class), [VEHICLE_CLASSES.index(name) for name in classes])
+    at = np.array([PARAMETERS.index(name) for name in rows])
+    values = np.asarray(list(rows.values()))
+    leaves = {
+        name: np.array(getattr(population, name))
+        for name in ("median", "spread", "lower", "upper", "loading")
+    }
+    for k, name in enumerate(("median", "spread", "lower", "upper")):
+        leaves[name][np.ix_(types, at)] = values[:, k]
+    leaves["loading"][np.ix_(types, at)] = 0
+    size = len(PARAMETERS)
+    roots = np.tile(np.eye(size), (len(types), 1, 1))
+    # In the order of the columns, so that the root stays lower triangular.
+    correlation = np.eye(size)
+    correlation[np.ix_(at, at)] = factor @ factor.T
+    roots[types] = np.linalg.cholesky(correlation)
+    leaves["factor"] = roots
+    return replace(population, **{name: jnp.asarray(leaf, jnp.float32) for name, leaf in leaves.items()})
+
+
 def from_vtypes(types: Sequence[VehicleType]) -> Population:
     """SUMO's vehicle types, one row each in the given order, with their probabilities as shares.
 
@@ -515,6 +555,7 @@ __all__ = [
     "Population",
     "default_population",
     "from_vtypes",
+    "refit",
     "sample",
     "sample_vehicles",
     "uniform_population",

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.policies.limsim_tm.decide import Told, grouped, neighbours, tell
 from limsim_jax.policies.limsim_tm.plan import Lattice, Merge, Others, Task, plan, room_needed
 from limsim_jax.policies.limsim_tm.search import Settings, no_plan, shifted
@@ -100,6 +100,9 @@ class LimSimTM:
         # go on with a lane change until the middle of the body is on the other lane, as long as it is safe
         side = jnp.where(side * d < -0.3, 0, side)
         need = lane_map.routes.lanes_to_go[lane, goal]
+        # a lane on that side may lead nowhere: the change may be possible only further on
+        aside = jnp.where(need > 0, lane_map.left[lane], lane_map.right[lane])
+        need = jnp.where(self._leads_on(lane_map, state, slot, lane, aside, s), need, 0)
         room = lane_map.routes.change_distance[lane, goal] - s
         press = urgency(need, room, state.v[slot], state.driver.lane_change_time[slot])
         wish = jnp.where((wish * need < 0) & (press > 0.3), 0, wish)
@@ -178,7 +181,21 @@ class LimSimTM:
         allowed = jnp.where(left, lane_map.may_change_left[lane], lane_map.may_change_right[lane])
         other = jnp.where(left, lane_map.left[lane], lane_map.right[lane])
         usable = ((lane_map.access[other] >> state.shape.vehicle_class[slot]) & 1) == 1
-        return allowed & usable & ~lane_map.is_connector[lane] & (state.lane[slot] == lane)
+        allowed &= usable & ~lane_map.is_connector[lane] & (state.lane[slot] == lane)
+        return allowed & self._leads_on(lane_map, state, slot, lane, other, state.s[slot])
+
+    def _leads_on(
+        self, lane_map: LaneMap, state: State, slot: Array, lane: Array, other: Array, s: Array
+    ) -> Bool[Array, " V"]:
+        """Whether the goal can be reached from the lane beside, by no longer way and without a hurry."""
+        routes, goal = lane_map.routes, state.goal[slot]
+        there = (other != NO_LANE) & routes.reachable[other, goal]
+        there &= routes.distance[other, goal] <= routes.distance[lane, goal] + 1.0
+        count = jnp.abs(routes.lanes_to_go[other, goal]).astype(s.dtype)
+        time = 3 * state.driver.lane_change_time[slot] * (count + 1)
+        back = routes.change_distance[other, goal] - s > jnp.maximum(state.v[slot], CREEP_SPEED) * time
+        fewer = count < jnp.abs(routes.lanes_to_go[lane, goal]).astype(s.dtype)
+        return there & ((count == 0) | fewer | back)
 
     def _speed(self, told: Told, late: Float[Array, " V"]) -> Float[Array, "V H"]:
         """Speeds that the search had in mind, at the moments of the plan, m/s."""
