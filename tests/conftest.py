@@ -8,6 +8,11 @@ from pathlib import Path
 _cache = tempfile.TemporaryDirectory(prefix="limsim-jax-tests-")
 os.environ["LIMSIM_JAX_CACHE"] = _cache.name
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Most of the time of a test run is compilation, and most of that the optimisation of machine code, which
+# runs of a few seconds do not earn back. XLA's own passes, which decide what is computed, stay as they are.
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+)
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

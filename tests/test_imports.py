@@ -24,6 +24,7 @@ ORDER = [
     {"rollout"},
     {"metrics"},
     {"sweep", "calibration", "log_replay"},
+    {"training"},
     {"report", "bridges"},
     {"bench"},
     {"cli"},

@@ -1,6 +1,7 @@
 """Trajectories of LimSim-TM: boundary conditions, bounds, and what is seen ahead."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -47,36 +48,39 @@ def way(bends, limit=15.0):
 
 
 def task(
-    bends=(0.0,), v=10.0, a=0.0, d=0.0, slope=0.0, lead=(NO_GAP, 0.0), wall=NO_GAP, others=None, limit=15.0
-):
+    bends=(0.0,), v: Any = 10.0, a: Any = 0.0, d: Any = 0.0, slope: Any = 0.0, lead=(NO_GAP, 0.0),
+    wall: Any = NO_GAP, others=None, limit=15.0,
+):  # fmt: skip
     """Vehicles on their ways; a number counts for all of them."""
     count = len(bends)
 
     def each(value):
         return jnp.broadcast_to(jnp.asarray(value, jnp.float32), (count,))
 
-    zero = each(0.0)
+    zero, none = each(0.0), jnp.zeros((count, K))
     start = Frenet(zero, each(v), each(a), each(d), each(slope) * each(v), zero, each(slope), zero)
     h = LATTICE.moments
     if others is None:
         shape = (count, K, h)
-        nobody = Others(
-            *(jnp.full(shape, 1e4),) * 2,
-            jnp.zeros(shape),
-            *(jnp.ones((count, K)),) * 2,
-            jnp.zeros((count, K), bool),
-        )
-        others = nobody
+        away, unit = jnp.full(shape, 1e4), jnp.ones((count, K))
+        others = Others(away, away, jnp.zeros(shape), unit, unit, jnp.zeros((count, K), bool))
     return Task(
         way=way(bends, limit), start=start, length=each(4.8), width=each(1.9), driver=drivers(count),
         lead_gap=each(lead[0])[:, None], lead_v=each(lead[1])[:, None], wall=each(wall), other=others,
-        merge=Merge(*(jnp.zeros((count, K)),) * 3, jnp.zeros((count, K), bool), zero),
+        merge=Merge(none, none, none, none > 0, zero),
         wanted=jnp.full((count, h), 1e3), steering=each(0.5), wheelbase=each(2.8),
     )  # fmt: skip
 
 
 planned = jax.jit(functools.partial(plan, LATTICE, ACC()))
 sampled = jax.jit(functools.partial(sample, LATTICE, ACC()))
+
+
+def at(curve: Any, numbers, t):
+    return curve(*(jnp.float32(x) for x in numbers), jnp.asarray(t, jnp.float32))
+
+
+quintic_at, quartic_at = functools.partial(at, quintic), functools.partial(at, quartic)
 
 
 def test_quintic_and_quartic_meet_their_boundary_conditions():
@@ -87,29 +91,18 @@ def test_quintic_and_quartic_meet_their_boundary_conditions():
         t = np.linspace(0, end, 7)
         reference = BPoly.from_derivatives([0, end], [[x0, v0, a0], [x1, v1, a1]])
         wanted = [reference.derivative(k)(t) if k else reference(t) for k in range(4)]
-        got = quintic(*(jnp.float32(x) for x in (x0, v0, a0, x1, v1, a1, end)), jnp.asarray(t, jnp.float32))
+        got = quintic_at([x0, v0, a0, x1, v1, a1, end], t)
         for one, other in zip(got[:1], wanted[:1], strict=True):
             np.testing.assert_allclose(one, other, atol=1e-4 * max(1, np.abs(other).max()))
         for one, other in zip(got[1:], wanted[1:], strict=True):  # at the end derivatives of rest count
             np.testing.assert_allclose(one[:-1], other[:-1], atol=2e-4 * max(1, np.abs(other).max()))
-        s, v, a, _ = quartic(
-            *(jnp.float32(x) for x in (v0, a0, v1)),
-            jnp.float32(end),
-            jnp.asarray([0, end, end + 2], jnp.float32),
-        )
+        s, v, a, _ = quartic_at([v0, a0, v1, end], [0, end, end + 2])
         np.testing.assert_allclose([s[0], v[0], a[0]], [0, v0, a0], atol=1e-5)
         np.testing.assert_allclose([v[1], a[1]], [v1, 0], atol=1e-4)
         np.testing.assert_allclose(s[2] - s[1], 2 * v1, atol=1e-4)
-        # the quartic is the quintic without the fifth power: its distance is the one that has none
-        power = np.polynomial.polynomial.polyfit(
-            np.linspace(0, end, 5),
-            quartic(
-                *(jnp.float32(x) for x in (v0, a0, v1)),
-                jnp.float32(end),
-                jnp.linspace(0, end, 5).astype(jnp.float32),
-            )[0],
-            4,
-        )
+        # distance is a polynomial of the fourth degree
+        five = np.linspace(0, end, 5)
+        power = np.polynomial.polynomial.polyfit(five, quartic_at([v0, a0, v1, end], five)[0], 4)
         np.testing.assert_allclose(power[1], v0, atol=5e-3)
 
 

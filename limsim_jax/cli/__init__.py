@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from limsim_jax import __version__
-from limsim_jax.cli import results
+from limsim_jax.cli import fitting, results
 
 if TYPE_CHECKING:
     from limsim_jax.maps.network import ImportReport, Network
@@ -40,6 +40,7 @@ bench_app = typer.Typer(help="Measure speed on this machine.", no_args_is_help=T
 app.add_typer(map_app, name="map")
 app.add_typer(bench_app, name="bench")
 results.add_commands(app)
+fitting.add_commands(app)
 
 MapArgument = Annotated[
     str, typer.Argument(metavar="FILE", help="Map file, gzipped or not, or the name of a bundled map.")

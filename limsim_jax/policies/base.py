@@ -15,10 +15,15 @@ from limsim_jax.types import Config, State
 class Policy(Protocol):
     """A pure function of the world with a memory of its own; written for one world."""
 
-    free: bool
-    """Whether its egos move in the plane, by a trajectory or by controls, or keep to lanes."""
-    others: int
-    """How many vehicles of the traffic it can drive at a time beside the egos: rows of `State.egos`."""
+    @property
+    def free(self) -> bool:
+        """Whether its egos move in the plane, by a trajectory or by controls, or keep to lanes."""
+        ...
+
+    @property
+    def others(self) -> int:
+        """How many vehicles of the traffic it can drive at a time beside the egos: rows of `State.egos`."""
+        ...
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         """The memory at the start: any pytree, of the same shapes ever after."""

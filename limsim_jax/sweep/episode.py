@@ -282,10 +282,10 @@ class _Braking:
 
 @cache
 def _source_hash() -> str:
-    """Of all code that makes rows: rows of other code are other rows."""
+    """Of all code, and weights, that make rows: rows of other code are other rows."""
     package = Path(limsim_jax.__file__).parent
     hashed = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
+    for path in sorted([*package.rglob("*.py"), *package.rglob("*.npz")]):
         if path.relative_to(package).parts[0] in ("bench.py", "cli", "report"):
             continue
         hashed.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())

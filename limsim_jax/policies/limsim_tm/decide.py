@@ -80,11 +80,13 @@ def corridor(
         wanted.append(good)
         room.append(last)
     must = own != 0
+    wanted_left = jnp.asarray(jnp.where(must, own, wanted[0]))
+    wanted_right = jnp.asarray(jnp.where(must, own, -wanted[1]))
     return Corridor(
         left=found[0],
         right=found[1],
-        wanted_left=jnp.where(must, jnp.maximum(own, 0) + jnp.where(own < 0, own, 0), wanted[0]),
-        wanted_right=jnp.where(must, own, -wanted[1]),
+        wanted_left=wanted_left,
+        wanted_right=wanted_right,
         to_go=jnp.where(must, routes.change_distance[lane, goal] - s, jnp.minimum(room[0], room[1])),
     )
 

@@ -143,6 +143,7 @@ _RSS_UNTIL = 1.5  # s; later there will be another plan
 _APPROACH = 0.6  # of the comfortable deceleration: slows down for bends and limits ahead
 _STOPPING, _STOPPING_LATE = 0.8, 1.5  # of it: stops at lines, and at the end of a lane that it has to leave
 _MERGE_BRAKING = 2.0  # m/s^2
+_STRETCH = 30.0  # m
 _HURRY = 2.5  # times the weight of efficiency
 _MIN_LATERAL = 10.0  # m, least distance in which the offset changes
 
@@ -255,6 +256,11 @@ def plan(lattice: Lattice, model: CarFollowing, task: Task) -> Plan:
     )
 
 
+def _fastest(task: Task, envelope: Float[Array, "V M"]) -> Float[Array, " V"]:
+    """The highest speed that is allowed anywhere on the next stretch, m/s."""
+    return jnp.max(envelope[:, : max(2, int(_STRETCH / task.way.step))], -1)
+
+
 def _along(
     lattice: Lattice, model: CarFollowing, task: Task, envelope: Float[Array, "V M"]
 ) -> tuple[Array, Array, Array, Array]:
@@ -262,7 +268,7 @@ def _along(
     start, t = task.start, lattice.times()[None, None]
     v0, a0 = start.v[:, None, None], jnp.clip(start.a, -8.0, 4.0)[:, None, None]
     # end speeds from a standstill to the fastest that is allowed where it would be then
-    top = jnp.max(envelope[:, : max(2, int(30 / task.way.step))], -1)
+    top = _fastest(task, envelope)
     share = jnp.linspace(0.0, 1.0, lattice.speeds)
     parts = []
     for end in lattice.horizons:
@@ -277,7 +283,7 @@ def _along(
     # stops at the wall
     distance = jnp.maximum(task.wall, 0.05)[:, None, None]
     stop = jnp.asarray(lattice.stops, v0.dtype)[None, :, None] * 2 * distance / jnp.maximum(v0, 0.5)
-    parts.append(quintic(jnp.zeros_like(v0), v0, a0, distance, 0.0, 0.0, jnp.clip(stop, 1.0, 15.0), t))
+    parts.append(quintic(jnp.zeros_like(v0), v0, a0, distance, 0.0, 0.0, jnp.clip(stop, 1.0, 60.0), t))
     # braking
     hard = [jnp.full_like(start.v, b) for b in lattice.braking] + [task.driver.b_max]
     b = jnp.stack(hard, -1)[:, :, None]
@@ -356,7 +362,8 @@ def _costs(
         return (low + jnp.clip(u - k.astype(u.dtype), 0, 1) * (high - low)).reshape(s.shape)
 
     allowed = along(envelope)
-    slow, over = jnp.maximum(allowed - v, 0), jnp.maximum(v - allowed, 0)
+    # against one speed for all samples: who gets to where more is allowed must not look slower for it
+    slow, over = jnp.maximum(each(_fastest(task, envelope)) - v, 0), jnp.maximum(v - allowed, 0)
     gap = jnp.minimum(
         task.lead_gap[:, None, None] + task.lead_v[:, None, None] * t[..., None] - s[..., None],
         NO_GAP,
@@ -431,13 +438,14 @@ def _no_gap(task: Task, s: Array, v: Array, t: Array) -> Float[Array, "V S H"]:
     """
     merge, missing = task.merge, jnp.zeros_like(s)
     for k in range(merge.s.shape[1]):
-        own = lambda value: value[:, k, None, None]  # noqa: B023, E731
-        ahead = own(merge.s) + own(merge.v) * t - s
-        lead = ahead > 0
-        need = room_needed(jnp.where(lead, v, own(merge.v)), jnp.where(lead, own(merge.v), v), _MERGE_BRAKING)
-        gap = jnp.abs(ahead) - (own(merge.length) + task.length[:, None, None]) / 2
+        its_v, its_length = merge.v[:, k, None, None], merge.length[:, k, None, None]
+        ahead = merge.s[:, k, None, None] + its_v * t - s
+        rear: Array = jnp.where(ahead > 0, v, its_v)
+        front: Array = jnp.where(ahead > 0, its_v, v)
+        need = room_needed(rear, front, _MERGE_BRAKING)
+        gap = jnp.abs(ahead) - (its_length + task.length[:, None, None]) / 2
         short = jnp.clip((need - gap) / 10.0, 0, 3.0)
-        missing = jnp.maximum(missing, jnp.where(own(merge.there), short, 0))
+        missing = jnp.maximum(missing, jnp.where(merge.there[:, k, None, None], short, 0))
     return missing
 
 

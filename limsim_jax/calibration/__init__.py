@@ -1,0 +1,1 @@
+"""Drivers from recordings: readers, cleaning, fits of car following, populations."""

@@ -1,0 +1,69 @@
+"""Commands that fit something to data: drivers to recordings, networks to rollouts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add `calibrate` and `train`."""
+    app.command()(calibrate)
+    app.command()(train)
+
+
+def calibrate(
+    data: Annotated[list[Path], typer.Argument(metavar="DATA...", help="Recordings of vehicles.")],
+    model: Annotated[Literal["idm", "iidm", "acc"], typer.Option(help="Car-following model.")] = "idm",
+    objective: Annotated[str, typer.Option(help="What to make least: gap, mixed, log or speed.")] = "mixed",
+    method: Annotated[
+        Literal["lm", "lbfgs", "adam", "de"], typer.Option(help="Optimiser; lm: Levenberg-Marquardt.")
+    ] = "lm",
+    shortest: Annotated[float, typer.Option(help="Leave out what is shorter, s.")] = 20.0,
+    seed: Annotated[int, typer.Option(help="Of all that is random.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the population of drivers here, for [traffic] drivers = FILE.")
+    ] = None,
+    speed_limit: Annotated[
+        float | None, typer.Option(help="Of the recorded road, m/s; relates desired speeds to limits.")
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON.")
+    ] = None,
+) -> None:
+    """Fit car following to recorded drivers: errors, uncertainty and the population they come from."""
+    import json
+
+    from limsim_jax.calibration.report import calibrate as fit
+    from limsim_jax.files import write_whole
+    from limsim_jax.rollout import enable_compilation_cache
+
+    enable_compilation_cache()
+    found = fit(data, model=model, objective=objective, method=method, shortest=shortest, seed=seed)
+    print(found.text())
+    if out is not None:
+        found.write_population(out, speed_limit=speed_limit)
+        print(f"wrote {out}")
+    if json_file is not None:
+        write_whole(json_file, (json.dumps(found.as_json(), indent=1) + "\n").encode())
+
+
+def train(
+    what: Annotated[Literal["pdm-hybrid"], typer.Argument(help="What to train.")],
+    out: Annotated[Path, typer.Option(help="Write the weights here.")] = Path("pdm_hybrid.npz"),
+    seeds: Annotated[int, typer.Option(help="Worlds of each scenario to learn from.")] = 48,
+    epochs: Annotated[int, typer.Option(help="Passes through the data.")] = 60,
+    policy: Annotated[str, typer.Option(help="Who drives in the worlds to learn from.")] = "like_traffic",
+) -> None:
+    """Train a policy's network on rollouts of the bundled scenarios."""
+    del what  # there is one
+    from limsim_jax.rollout import enable_compilation_cache, use_all_cores
+    from limsim_jax.training import train as fit
+
+    use_all_cores()
+    enable_compilation_cache()
+    report = fit(out, seeds=seeds, epochs=epochs, policy=policy, tell=print)
+    print(report)
+    print(f"wrote {out}")

@@ -1,0 +1,334 @@
+"""Planners outside JAX: any Python, torch or ONNX function, called once per decision for all worlds.
+
+A function of NumPy arrays drives the egos of the whole batch, here by pure pursuit and the IDM:
+
+    def follow(seen):
+        x, y = seen.way_x[..., 5] + seen.wheelbase / 2, seen.way_y[..., 5]  # 10 m ahead, from the rear axle
+        steering = np.arctan(2 * seen.wheelbase * y / (x * x + y * y))
+        ahead = seen.there & (np.abs(seen.other_y) < 1.5) & (seen.other_x > 0)
+        gap = np.where(ahead, seen.other_x - (seen.other_length + seen.length[..., None]) / 2, 1e6)
+        first = gap.argmin(-1)[..., None]
+        gap = np.maximum(np.take_along_axis(gap, first, -1)[..., 0], 0.1)
+        closing = np.where(gap < 1e5, seen.v - np.take_along_axis(seen.other_v, first, -1)[..., 0], 0)
+        stops = (seen.light <= SignalState.YELLOW) & (seen.light_distance < gap)
+        gap, closing = np.where(stops, seen.light_distance, gap), np.where(stops, seen.v, closing)
+        wish = np.maximum(2 + 1.2 * seen.v + seen.v * closing / (2 * 3**0.5), 0)
+        a = 1.5 * (1 - (seen.v / seen.limit) ** 4 - (wish / gap) ** 2)
+        return {"acceleration": np.clip(a, -8, 1.5), "steering": steering}
+
+    Rollout(config, traffic, horizon=60.0, policy=HostPolicy(follow))
+
+An experiment file names a factory of such a policy as `policy = "package.module:factory"`. Under `vmap` the
+function is called once for all worlds; where a batch is shared among several devices, once for each. It has
+to be a pure function of what it sees: what it wants to remember it gives back as `memory`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from limsim_jax.geometry import wrap_angle
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap
+from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.policies.predict import nearest, straight
+from limsim_jax.policies.reference import body_lane, way_ahead
+from limsim_jax.traffic.ego import Control, Trajectory
+from limsim_jax.traffic.engine import Command
+from limsim_jax.types import Config, State
+
+Kind = Literal["control", "trajectory", "meta"]
+
+FAR = 1e6
+"""m to a light where there is none."""
+
+_LANES = 4  # beyond the own one, for lights
+
+
+class Observation(NamedTuple):
+    """What the egos see, `[B, E]`: `B` worlds, `E` egos, `M` points of the way, `K` others.
+
+    Places are in the frame of the ego: x ahead of the centre of its body, y to the left. Numbers of others
+    that are not `there`, and of rows of egos without a vehicle, mean nothing.
+    """
+
+    time: Any  # [B], s since the start
+    v: Any  # m/s
+    a: Any  # m/s^2
+    steering: Any  # rad
+    length: Any  # m
+    width: Any
+    wheelbase: Any
+    limit: Any  # m/s
+    light: Any  # `SignalState` of the next light on the way
+    light_distance: Any  # m from the front bumper to its stop line, `FAR` if there is none
+    to_go: Any  # lanes to cross for the route, left > 0
+    to_go_within: Any  # m
+    way_x: Any  # [B, E, M], m, middle of the lane along the route
+    way_y: Any
+    way_heading: Any  # rad
+    way_limit: Any  # m/s
+    there: Any  # [B, E, K], bool
+    other_x: Any  # m, centre
+    other_y: Any
+    other_heading: Any  # rad
+    other_v: Any  # m/s
+    other_length: Any  # m
+    other_width: Any
+
+
+@dataclass(frozen=True)
+class Observe:
+    """Makes an `Observation` of one world.
+
+    Attributes:
+      nearest: others, `K`.
+      points: of the way, `M`.
+      step: m between them.
+    """
+
+    nearest: int = 8
+    points: int = 40
+    step: float = 2.0
+
+    def __call__(self, config: Config, lane_map: LaneMap, state: State) -> Observation:
+        """The world as its egos see it."""
+        egos, slot, shape = state.egos, state.egos.slot, state.shape
+        cos, sin = jnp.cos(egos.heading)[:, None], jnp.sin(egos.heading)[:, None]
+
+        def frame(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+            dx, dy = x - egos.x[:, None], y - egos.y[:, None]
+            return cos * dx + sin * dy, cos * dy - sin * dx
+
+        lane, s = body_lane(lane_map, state, slot)
+        goal = state.goal[slot]
+        after = jnp.where(lane == state.lane[slot], NO_LANE, state.lane[slot])
+        way = way_ahead(lane_map, lane, s, goal, points=self.points, step=self.step, after=after)
+        way_x, way_y = frame(way.x, way.y)
+        now = straight(lane_map, state, jnp.zeros(1, state.v.dtype))
+        near = nearest(lane_map, state, now, slot, self.nearest)
+        other_x, other_y = frame(now.x[near, 0], now.y[near, 0])
+        light, distance = _next_light(lane_map, state)
+        own = state.lane[slot]
+        return Observation(
+            time=config.time(state.step),
+            v=state.v[slot],
+            a=egos.a,
+            steering=egos.steering,
+            length=shape.length[slot],
+            width=shape.width[slot],
+            wheelbase=shape.wheelbase[slot],
+            limit=lane_map.speed_limit[own],
+            light=light,
+            light_distance=distance,
+            to_go=lane_map.routes.lanes_to_go[own, goal],
+            to_go_within=lane_map.routes.change_distance[own, goal] - state.s[slot],
+            way_x=way_x,
+            way_y=way_y,
+            way_heading=wrap_angle(way.heading - egos.heading[:, None]),
+            way_limit=way.limit,
+            there=near >= 0,
+            other_x=other_x,
+            other_y=other_y,
+            other_heading=wrap_angle(now.heading[near, 0] - egos.heading[:, None]),
+            other_v=state.v[near],
+            other_length=shape.length[near],
+            other_width=shape.width[near],
+        )
+
+
+def _next_light(lane_map: LaneMap, state: State) -> tuple[jax.Array, jax.Array]:
+    """What the next light shows, and m to its stop line."""
+    slot = state.egos.slot
+    lane, goal = state.lane[slot], state.goal[slot]
+    shows = lane_states(lane_map.signals, state.lights.phase)
+    end = lane_map.length[lane] - state.s[slot]
+    light, distance = jnp.full_like(lane, SignalState.OFF), jnp.full_like(end, FAR)
+    for _ in range(_LANES):
+        following = lane_map.routes.next_lane[lane, goal]
+        line = end - (lane_map.length - lane_map.stop_s)[lane]
+        shown = shows[following].astype(light.dtype)
+        found = (distance >= FAR) & (following != NO_LANE) & (shown != SignalState.OFF) & (line > 0)
+        light, distance = jnp.where(found, shown, light), jnp.where(found, line, distance)
+        end, lane = end + lane_map.length[following], following
+    return light, distance
+
+
+def _empty_road(seen: Any) -> Any:
+    """An observation of these shapes to try a function on: a straight empty road, where that is known."""
+    zeros = jax.tree.map(lambda x: np.zeros((1, *x.shape), x.dtype), seen)
+    if not isinstance(zeros, Observation):
+        return zeros
+    steps = np.arange(zeros.way_x.shape[-1], dtype=np.float32)
+    return zeros._replace(
+        **{name: np.full_like(zeros.v, 10.0) for name in ("v", "limit")},
+        length=zeros.length + np.float32(5.0),
+        width=zeros.width + np.float32(2.0),
+        wheelbase=zeros.wheelbase + np.float32(3.0),
+        light=zeros.light + SignalState.OFF,
+        light_distance=zeros.light_distance + np.float32(FAR),
+        way_x=zeros.way_x + 2 * steps,
+        way_limit=zeros.way_limit + np.float32(10.0),
+    )
+
+
+@dataclass(frozen=True)
+class HostPolicy:
+    """Egos driven by a function on the host.
+
+    `function(seen)` gets what `observe` makes of all worlds, as NumPy arrays with a first axis `B`, and gives
+    back a mapping of arrays, by `command`:
+
+    - "control": `acceleration` (m/s^2) and `steering` (rad), `[B, E]`, held until the next decision;
+    - "trajectory": `x`, `y` (m), `heading` (rad), `v` (m/s), `[B, E, samples]`, of the centre of the body in
+      the frame of the ego, every `dt` s from now on;
+    - "meta": `meta`, `[B, E]`, whole numbers: `traffic.ego.Meta`, -1: like the traffic.
+
+    With `memory`, it is `function(seen, memory)` with an array `[B, E, memory]`, zeros at the start, and
+    gives back the mapping and the new array. Before anything is compiled it is tried on one empty straight
+    road; what is wrong there is a `ValueError` of one line. What goes wrong later (a number that is not
+    finite) ends the run with a line of the same kind.
+
+    Attributes:
+      function: the planner.
+      command: what it gives back.
+      memory: numbers kept for each ego.
+      observe: makes a pytree of arrays of one world: `(config, lane_map, state)`.
+      samples: of trajectories.
+      dt: s between them.
+    """
+
+    function: Callable[..., Any]
+    command: Kind = "control"
+    memory: int = 0
+    observe: Callable[[Config, LaneMap, State], Any] = field(default_factory=Observe)
+    samples: int = 41
+    dt: float = 0.1
+    free: bool = field(init=False)
+
+    others = 0
+
+    def __post_init__(self) -> None:
+        if self.command not in get_args(Kind):
+            raise ValueError(f"command: '{self.command}'; known are {', '.join(get_args(Kind))}")
+        if self.memory < 0:
+            raise ValueError(f"memory: {self.memory} numbers; 0 or more")
+        if self.samples < 2 or not self.dt > 0:
+            raise ValueError(f"{self.samples} samples every {self.dt} s; 2 or more, and more than 0 s")
+        object.__setattr__(self, "free", self.command != "meta")
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """Zeros; tries the function first.
+
+        Raises:
+          ValueError: the function fails, or gives back something else than it should.
+        """
+        count = state.egos.slot.shape[0]
+        seen = jax.eval_shape(lambda lane_map, state: self.observe(config, lane_map, state), lane_map, state)
+        none = np.zeros((1, count, self.memory), np.float32)
+        self._call(_empty_road(seen), none, 1, count, finite=False)
+        return jnp.zeros((count, self.memory), jnp.float32)
+
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
+    ) -> tuple[Command, Any]:
+        """Ask the function."""
+        del key
+        egos, seen = state.egos, self.observe(config, lane_map, state)
+        count = egos.slot.shape[0]
+        shapes = {name: (count, *rest) for name, rest in self._fields().items()}
+
+        def ask(one: Any, seen: Any, memory: Any) -> Any:
+            # the leading axes of `one` are those that `vmap` has added
+            batch = np.shape(one)
+            size = int(np.prod(batch))
+            flat = jax.tree.map(
+                lambda x: np.asarray(x).reshape(size, *np.shape(x)[len(batch) :]), (seen, memory)
+            )
+            found, kept = self._call(flat[0], flat[1], size, count)
+            return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), (found, kept))
+
+        kind = jnp.int32 if self.command == "meta" else jnp.float32
+        wanted = {name: jax.ShapeDtypeStruct(shape, kind) for name, shape in shapes.items()}
+        kept = jax.ShapeDtypeStruct(memory.shape, jnp.float32)
+        found, memory = jax.pure_callback(
+            ask, (wanted, kept), jnp.zeros(()), seen, memory, vmap_method="broadcast_all"
+        )
+        if self.command == "control":
+            return Command(control=Control(**found)), memory
+        if self.command == "meta":
+            return Command(meta=found["meta"]), memory
+        cos, sin = jnp.cos(egos.heading)[:, None], jnp.sin(egos.heading)[:, None]
+        trajectory = Trajectory(
+            x=egos.x[:, None] + cos * found["x"] - sin * found["y"],
+            y=egos.y[:, None] + sin * found["x"] + cos * found["y"],
+            heading=wrap_angle(egos.heading[:, None] + found["heading"]),
+            v=found["v"],
+            t0=config.time(state.step),
+            dt=self.dt,
+        )
+        return Command(trajectory=trajectory), memory
+
+    def _fields(self) -> dict[str, tuple[int, ...]]:
+        """Names of what the function gives back, and their axes behind `[B, E]`."""
+        if self.command == "control":
+            return {"acceleration": (), "steering": ()}
+        if self.command == "meta":
+            return {"meta": ()}
+        return {name: (self.samples,) for name in ("x", "y", "heading", "v")}
+
+    def _call(
+        self, seen: Any, memory: Any, size: int, count: int, finite: bool = True
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Call the function for `size` worlds and check what comes back."""
+        name = getattr(self.function, "__qualname__", type(self.function).__qualname__)
+        try:
+            found = self.function(seen, memory) if self.memory else self.function(seen)
+        except Exception as error:
+            raise ValueError(f"{name}: {type(error).__name__}: {error}") from error
+        if self.memory:
+            if not (isinstance(found, tuple) and len(found) == 2):
+                raise ValueError(f"{name}: gives back {_what(found)}, not a mapping and the new memory")
+            found, memory = found
+        if not isinstance(found, Mapping) or set(found) != set(self._fields()):
+            raise ValueError(
+                f"{name}: gives back {_what(found)}, not a mapping of {', '.join(self._fields())}"
+            )
+        kind = np.int32 if self.command == "meta" else np.float32
+        checked: dict[str, np.ndarray] = {}
+        for field_, rest in self._fields().items():
+            checked[field_] = _checked(name, field_, found[field_], (size, count, *rest), kind, finite)
+        shape = (size, count, self.memory)
+        return checked, _checked(name, "memory", memory, shape, np.float32, finite)
+
+
+def _what(found: Any) -> str:
+    return (
+        f"a mapping of {', '.join(map(str, found))}" if isinstance(found, Mapping) else type(found).__name__
+    )
+
+
+def _checked(
+    name: str, field_: str, value: Any, shape: tuple[int, ...], kind: Any, finite: bool
+) -> np.ndarray:
+    """The array as it should be, or a `ValueError` that says how it is."""
+    try:
+        array = np.asarray(value)
+        numbers = np.issubdtype(array.dtype, np.integer if kind is np.int32 else np.number)
+    except (TypeError, ValueError):
+        array, numbers = np.zeros(0), False
+    if not numbers or np.iscomplexobj(array):
+        wanted = "whole numbers" if kind is np.int32 else "numbers"
+        raise ValueError(f"{name}: {field_} is {_what(value)} of {array.dtype}, not an array of {wanted}")
+    if array.shape != shape:
+        raise ValueError(f"{name}: {field_} has shape {list(array.shape)}, not [B, E, ...] = {list(shape)}")
+    if finite and not np.isfinite(array).all():
+        world, ego = np.argwhere(~np.isfinite(array))[0][:2]
+        bad = array[~np.isfinite(array)][0]
+        raise ValueError(f"{name}: {field_} of ego {ego} in world {world} of the call is {bad}")
+    return np.ascontiguousarray(array, kind)

@@ -1,0 +1,248 @@
+"""Planners on the host: called once for all worlds, inside scan, vmap, shard_map and jit."""
+
+import dataclasses
+import functools
+import re
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from traffic_worlds import bundled, no_arrivals, state_of
+
+from limsim_jax.maps.lane_map import lane_rows, pose
+from limsim_jax.maps.signals import SignalState
+from limsim_jax.policies import host
+from limsim_jax.policies.host import HostPolicy, Observe
+from limsim_jax.rollout import Rollout, Worlds
+from limsim_jax.sweep.episode import Episodes
+from limsim_jax.sweep.experiment import Experiment
+from limsim_jax.traffic.ego import Meta, from_lane
+from limsim_jax.traffic.engine import Traffic
+from limsim_jax.traffic.motion import boxes
+from limsim_jax.types import Config, Scenario
+
+CONFIG = Config(dt=0.1)
+N = 4
+calls: list[tuple[int, ...]] = []
+
+
+def example():
+    """The function of the module's docstring."""
+    code = re.search(r"( {4}def follow.*?)\n\n", host.__doc__ or "", re.DOTALL)
+    assert code is not None
+    names = {"np": np, "SignalState": SignalState}
+    exec(textwrap.dedent(code[1]), names)
+    return names["follow"]
+
+
+def follow(seen):
+    """The same, and notes how many worlds it was called for."""
+    calls.append(seen.v.shape)
+    return example()(seen)
+
+
+def follower() -> HostPolicy:
+    """What an experiment file names."""
+    return HostPolicy(follow)
+
+
+def broken() -> HostPolicy:
+    return HostPolicy(lambda seen: {"acceleration": seen.v[0], "steering": seen.v})
+
+
+@functools.cache
+def rows():
+    """Two lanes one after the other on the motorway, and a goal."""
+    network, lane_map = bundled("highway")
+    routes = lane_map.routes
+    lane = next(
+        row for row in lane_rows(network).values()
+        if int(lane_map.right[row]) == -1 and float(lane_map.length[row]) > 500
+    )  # fmt: skip
+    goal = int(np.nonzero(np.asarray(routes.reachable[lane] & (routes.lanes_to_go[lane] == 0)))[0][0])
+    return lane, goal
+
+
+def world(gap: float, v: float, free: bool = True):
+    """An ego `gap` m behind a vehicle at 15 m/s."""
+    lane, goal = rows()
+    state = state_of(
+        "highway", [lane] * N, [60.0, 65.0 + gap, 10.0, 10.0], [v, 15.0, 0.0, 0.0], [goal] * N,
+        active=jnp.array([True, True, False, False]),
+    )  # fmt: skip
+    lane_map = bundled("highway")[1]
+    return dataclasses.replace(state, egos=from_lane(lane_map, state, boxes(lane_map, state), [0], free))
+
+
+def scenario(key):
+    """Worlds that differ: the gap to the leader."""
+    state = world(20.0, 20.0)
+    gap = jax.random.uniform(key, (), minval=15.0, maxval=45.0)
+    return Scenario(start=dataclasses.replace(state, s=state.s.at[1].add(gap)), schedule=no_arrivals(state))
+
+
+def rollout(policy, horizon=10.0):
+    return Rollout(CONFIG, Traffic(), horizon=horizon, policy=policy)
+
+
+def run_one(run, state):
+    lane_map = bundled("highway")[1]
+    return run.go_on(lane_map, no_arrivals(state), jax.random.key(0), run.begin(lane_map, state))
+
+
+def stack(states):
+    return jax.tree.map(lambda *x: jnp.stack(x), *states)
+
+
+def test_one_call_per_decision_for_all_worlds():
+    run = rollout(follower())
+    states = [world(15.0, 20.0), world(30.0, 12.0), world(45.0, 25.0)]
+    many = jax.jit(jax.vmap(lambda state: run_one(run, state)[0].state))
+    together = many.lower(stack(states)).compile()
+    calls.clear()
+    end = jax.block_until_ready(together(stack(states)))
+    assert calls == [(3, 1)] * run.decisions
+    shuffled = together(stack([states[2], states[2], states[0]]))
+    for k, row in enumerate((2, 2, 0)):
+        np.testing.assert_array_equal(shuffled.s[k], end.s[row])
+        np.testing.assert_array_equal(shuffled.egos.y[k], end.egos.y[row])
+    assert len(np.unique(np.asarray(end.v[:, 0]).round(2))) == 3, "the worlds are not alike"
+    gap = np.asarray(end.s[:, 1] - end.s[:, 0]) - 5
+    assert (gap > 2).all() and (np.asarray(end.status)[:, 0] == 0).all()
+    assert np.abs(end.d[:, 0]).max() < 0.3
+
+
+def test_it_runs_where_batches_are_shared_among_devices():
+    lane_map = bundled("highway")[1]
+    worlds = Worlds(rollout(follower(), 2.0), lane_map, scenario, chunk=3)
+    worlds.run_totals([5])
+    calls.clear()
+    totals = worlds.run_totals(range(3))
+    assert calls and all(shape == (worlds.chunk // jax.local_device_count(), 1) for shape in calls)
+    assert (totals.distance > 0).all() and not totals.collided.any()
+
+
+def test_the_observation_is_what_there_is():
+    lane_map = bundled("highway")[1]
+    state = world(25.0, 18.0)
+    seen = jax.jit(lambda state: Observe(nearest=3, points=10)(CONFIG, lane_map, state))(state)
+    assert float(seen.v[0]) == 18.0 and float(seen.limit[0]) == float(lane_map.speed_limit[rows()[0]])
+    np.testing.assert_array_equal(seen.there[0], [True, False, False])
+    np.testing.assert_allclose([seen.other_x[0, 0], seen.other_y[0, 0]], [30.0, 0.0], atol=0.2)
+    assert float(seen.other_v[0, 0]) == 15.0 and float(seen.light_distance[0]) == host.FAR
+    lane, _ = rows()
+    x, y, heading = pose(lane_map, jnp.full(10, lane), 57.5 + 2.0 * jnp.arange(10.0))
+    x0, y0, h0 = (float(np.asarray(values)[0]) for values in (x, y, heading))
+    np.testing.assert_allclose(seen.way_x[0], np.cos(h0) * (x - x0) + np.sin(h0) * (y - y0), atol=1e-2)
+    np.testing.assert_allclose(seen.way_y[0], np.cos(h0) * (y - y0) - np.sin(h0) * (x - x0), atol=1e-2)
+
+
+def ask(policy, state, memory=None):
+    """One decision."""
+    lane_map = bundled("highway")[1]
+    memory = policy.init(CONFIG, lane_map, state) if memory is None else memory
+    return jax.jit(lambda state, memory: policy(CONFIG, lane_map, state, memory, jax.random.key(0)))(
+        state, memory
+    )
+
+
+def test_memory_and_trajectories():
+    def remember(seen, memory):
+        memory = memory + np.array([1.0, 0.0], np.float32)
+        memory[..., 1] = seen.v
+        t = 0.1 * np.arange(21)
+        line = seen.v[..., None] * t
+        zero = np.zeros_like(line)
+        return {"x": line, "y": zero + 1.0, "heading": zero, "v": zero + seen.v[..., None]}, memory
+
+    policy = HostPolicy(remember, command="trajectory", memory=2, samples=21)
+    state = world(60.0, 17.0)
+    command, memory = ask(policy, state)
+    command, memory = ask(policy, state, memory)
+    np.testing.assert_allclose(memory, [[2.0, 17.0]])
+    found, egos = command.trajectory, state.egos
+    cos, sin = np.cos(egos.heading[0]), np.sin(egos.heading[0])
+    np.testing.assert_allclose(found.x[0], egos.x[0] + cos * 1.7 * np.arange(21) - sin, atol=1e-3)
+    np.testing.assert_allclose(found.y[0], egos.y[0] + sin * 1.7 * np.arange(21) + cos, atol=1e-3)
+    np.testing.assert_allclose(found.v, 17.0)
+    assert policy.free and found.dt == 0.1
+
+
+def test_meta_actions():
+    policy = HostPolicy(lambda seen: {"meta": np.full(seen.v.shape, Meta.DECELERATE)}, command="meta")
+    command, _ = ask(policy, world(60.0, 17.0, free=False))
+    assert policy.free is False and command.trajectory is None and command.control is None
+    np.testing.assert_array_equal(command.meta, [Meta.DECELERATE])
+
+
+def gives(found, **more):
+    return HostPolicy(lambda *seen: found, **more)
+
+
+@pytest.mark.parametrize(
+    "policy, message",
+    [
+        (gives(None), "gives back NoneType, not a mapping of acceleration, steering"),
+        (gives({"steering": 0}), "gives back a mapping of steering, not a mapping of acceleration, steering"),
+        (gives({"acceleration": 0.0, "steering": 0.0}), r"acceleration has shape \[\], not .* \[1, 1\]"),
+        (
+            gives({"meta": np.zeros((1, 1))}, command="meta"),
+            "meta is ndarray of float64, not .* whole numbers",
+        ),
+        (
+            gives({"acceleration": "fast", "steering": 0}),
+            "acceleration is str of .*, not an array of numbers",
+        ),
+        (gives({}, memory=1), "gives back a mapping of , not a mapping and the new memory"),
+        (HostPolicy(lambda seen: 1 / 0), "ZeroDivisionError: division by zero"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_compiled(policy, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        policy.init(CONFIG, bundled("highway")[1], world(20.0, 10.0))
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_options_are_named():
+    with pytest.raises(ValueError, match="command: 'steer'; known are control, trajectory, meta"):
+        HostPolicy(follow, command="steer")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="memory: -1 numbers"):
+        HostPolicy(follow, memory=-1)
+    with pytest.raises(ValueError, match="1 samples every"):
+        HostPolicy(follow, samples=1)
+
+
+def test_numbers_that_are_not_finite_end_the_run():
+    def late(seen):
+        a = np.where(seen.time[:, None] > 0.7, np.nan, 0.0) + 0 * seen.v
+        return {"acceleration": a, "steering": 0 * seen.v}
+
+    state = world(60.0, 17.0)
+    ask(HostPolicy(late), state)
+    with pytest.raises(Exception, match=r"late: acceleration of ego 0 in world 0 of the call is nan"):
+        jax.block_until_ready(ask(HostPolicy(late), dataclasses.replace(state, step=jnp.int32(8))))
+
+
+def experiment(policy) -> Experiment:
+    told = {
+        "name": "host", "map": "highway", "horizon": 2.0, "slots": 8,
+        "ego": {"start": "1-", "s": 60.0, "goal": "2-", "policy": f"test_host_policy:{policy}"},
+        "traffic": {"vehicles": 3},
+    }  # fmt: skip
+    return Experiment.model_validate(told)
+
+
+def test_an_experiment_names_it():
+    assert Episodes(experiment("follower"), chunk=2).policy == "follower"
+    with pytest.raises(ValueError, match=r"acceleration has shape \[1\], not"):
+        Episodes(experiment("broken"), chunk=2).run([0])
+
+
+@pytest.mark.slow
+def test_episodes_run_with_it():
+    episodes = Episodes(experiment("follower"), chunk=2)
+    calls.clear()
+    found = episodes.run([0, 1])
+    assert calls and (found.metrics["distance"] > 20).all() and (found.metrics["contacts"] == 0).all()

@@ -1,0 +1,135 @@
+"""Predictions of all vehicles: against the engine's own motion, closed forms, and NumPy loops."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from traffic_worlds import bundled, scattered
+
+from limsim_jax.maps.lane_map import width
+from limsim_jax.policies.predict import Plans, constant_velocity, hypotheses, nearest, straight
+from limsim_jax.traffic.motion import advance, boxes
+from limsim_jax.types import Config
+
+CONFIG = Config(dt=0.1)
+TIMES = jnp.arange(9, dtype=jnp.float32) * 0.5
+N = 12
+
+
+def world(name, seed=0):
+    """Vehicles at several speeds, one of them standing; two change lanes if the map has room for that."""
+    state = scattered(name, N, seed)
+    lane_map = bundled(name)[1]
+    v = jnp.linspace(0.0, 22.0, N)
+    left = np.asarray(lane_map.left)[np.asarray(state.lane)]
+    side = np.zeros(N, np.int32)
+    side[np.nonzero(left >= 0)[0][:2]] = 1
+    between = (width(lane_map, state.lane, state.s) + width(lane_map, left, state.s)) / 2
+    shift = jnp.where(jnp.asarray(side) == 1, -between, 0.0)
+    return dataclasses.replace(state, v=v, side=jnp.asarray(side), shift=shift)
+
+
+@jax.jit
+def moved(lane_map, state):
+    """The engine's boxes at the times, if nobody accelerates; and who is still there."""
+
+    def step(state, _):
+        state, _, _ = advance(CONFIG, lane_map, state, jnp.zeros_like(state.v))
+        return state, (boxes(lane_map, state), state.active)
+
+    _, (box, active) = jax.lax.scan(step, state, None, length=40)
+    first = boxes(lane_map, state)[None]
+    return jnp.concatenate([first, box])[::5], jnp.concatenate([state.active[None], active])[::5]
+
+
+predict = jax.jit(constant_velocity)
+
+
+@pytest.mark.parametrize("name", ["highway", "intersection"])
+def test_constant_velocity_is_what_the_engine_does_without_acceleration(name):
+    state, lane_map = world(name), bundled(name)[1]
+    found = predict(lane_map, state, TIMES)
+    box, active = (np.asarray(x) for x in moved(lane_map, state))
+    assert active.any(1).all() and (name != "highway" or np.asarray(state.side).sum() == 2)
+    for k, (values, tolerance) in enumerate(((found.x, 0.12), (found.y, 0.12), (found.heading, 0.03))):
+        off = np.asarray(values).T - box[..., k]
+        off = off if k < 2 else np.remainder(off + np.pi, 2 * np.pi) - np.pi
+        assert np.abs(np.where(active, off, 0)).max() < tolerance, k
+    np.testing.assert_array_equal(found.length, state.shape.length)
+
+
+def test_offset_fades_and_stop_is_kept():
+    state = dataclasses.replace(scattered("highway", N, 3), d=jnp.linspace(-1.0, 1.0, N))
+    lane_map = bundled("highway")[1]
+    stop = jnp.full(N, 1e6).at[2].set(30.0).at[3].set(4.0)
+    found = predict(lane_map, state, TIMES, stop=stop)
+    free = predict(lane_map, dataclasses.replace(state, d=jnp.zeros(N)), TIMES)
+    apart = np.hypot(found.x - free.x, found.y - free.y)
+    np.testing.assert_allclose(apart[:, 0], np.abs(np.linspace(-1, 1, N)), atol=1e-3)
+    np.testing.assert_allclose(np.delete(apart[:, -2], [2, 3]), 0, atol=1e-3)
+    way = np.hypot(found.x - found.x[:, :1], found.y - found.y[:, :1])
+    # 15 m/s: braking with 15^2 / 60 = 3.75 m/s^2 at once; 4 m are not enough for anything but standing there
+    t = np.minimum(np.asarray(TIMES), 4.0)
+    np.testing.assert_allclose(way[2], 15 * t - 3.75 * t * t / 2, atol=0.3)
+    assert way[3].max() < 4.4 and way[4, -1] == pytest.approx(60.0, rel=1e-2)
+
+
+def test_plans_override_those_they_are_for():
+    state, lane_map = world("highway"), bundled("highway")[1]
+    line = jnp.broadcast_to(jnp.arange(9.0), (2, 9))
+    plans = Plans(slot=jnp.array([4, -1]), x=line, y=line + 1, heading=line * 0)
+    found, free = predict(lane_map, state, TIMES, plans=plans), predict(lane_map, state, TIMES)
+    np.testing.assert_array_equal(found.x[4], line[0])
+    np.testing.assert_array_equal(found.y[4], line[0] + 1)
+    others = np.delete(np.arange(N), 4)
+    np.testing.assert_array_equal(np.asarray(found.x)[others], np.asarray(free.x)[others])
+
+
+def test_straight_goes_along_the_heading():
+    state, lane_map = world("roundabout", 1), bundled("roundabout")[1]
+    found, box = straight(lane_map, state, TIMES), np.asarray(boxes(lane_map, state))
+    t, v = np.asarray(TIMES)[None], np.asarray(state.v)[:, None]
+    np.testing.assert_allclose(found.x, box[:, :1] + v * t * np.cos(box[:, 2:3]), atol=1e-3)
+    np.testing.assert_allclose(found.y, box[:, 1:2] + v * t * np.sin(box[:, 2:3]), atol=1e-3)
+
+
+def test_hypotheses_take_every_branch():
+    state, lane_map = scattered("roundabout", N, 2), bundled("roundabout")[1]
+    times = jnp.arange(13.0)
+    found = jax.jit(lambda state: hypotheses(lane_map, state, times))(state)
+    weight = np.asarray(found.weight)
+    np.testing.assert_allclose(weight.sum(1), 1, atol=1e-6)
+    several = (weight > 0).sum(1)
+    assert (several > 1).sum() >= 4 and (several == 1).any()
+    own = predict(lane_map, state, times)
+    for i in range(N):
+        modes = [m for m in range(3) if weight[i, m] > 0]
+        ends = [(float(found.x[i, m, -1]), float(found.y[i, m, -1])) for m in modes]
+        apart = [np.hypot(a[0] - b[0], a[1] - b[1]) for k, a in enumerate(ends) for b in ends[:k]]
+        assert min(apart, default=9.0) > 3.0, "branches end in different places"
+        gaps = np.abs(np.asarray(found.x)[i, modes] - np.asarray(own.x)[i]).max(-1)
+        assert gaps.min() < 1.0, "one of them is the route"
+    sure = hypotheses(lane_map, state, times, known=0.8)
+    with_split = several > 1
+    assert np.allclose(np.asarray(sure.weight)[with_split].max(-1), 0.8)
+    with pytest.raises(ValueError, match=r"probability of 1\.5"):
+        hypotheses(lane_map, state, times, known=1.5)
+
+
+def test_nearest_is_a_sort_of_distances():
+    state, lane_map = world("highway", 4), bundled("highway")[1]
+    state = dataclasses.replace(state, active=state.active.at[5].set(False))
+    found = predict(lane_map, state, TIMES)
+    slot = jnp.array([3, -1, 0])
+    got = np.asarray(nearest(lane_map, state, found, slot, 14))
+    x, y = np.asarray(found.x), np.asarray(found.y)
+    for row, me in ((0, 3), (2, 0)):
+        apart = {
+            j: np.hypot(x[j] - x[me], y[j] - y[me]).min() - float(found.length[j]) / 2
+            for j in range(N)
+            if j not in (me, 5)
+        }
+        assert list(got[row]) == [*sorted(apart, key=lambda j: apart[j]), -1, -1, -1, -1]
+    assert (got[1] == -1).all()
