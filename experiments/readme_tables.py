@@ -152,10 +152,38 @@ def sweep_speed(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def policies(result: dict[str, Any]) -> str:
+    """How well policies drive."""
+    from policies import table
+
+    return table(result["rows"])
+
+
+def calibration(result: dict[str, Any]) -> str:
+    """How well drivers can be fitted."""
+    rows = [
+        "| recordings | model | drivers | hours | error, calibration | error, rest of the time |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
+    for one in result.values():
+        for model, found in one.get("models", {}).items():
+            first, rest = (found["errors"][part]["mixed"]["median"] for part in ("calibration", "validation"))
+            rows.append(
+                f"| {one['title']} | {model} | {one['drivers']} | {one['seconds'] / 3600:.1f} "
+                f"| {100 * first:.1f} % | {100 * rest:.1f} % |"
+            )
+    made = result["synthetic"]["parameters"]
+    errors = (f"{name} {100 * made[name]['median_error']:.1f} %" for name in made)
+    rows += ["", f"Median over drivers. Median error of parameters on made-up drivers: {', '.join(errors)}."]
+    return "\n".join(rows)
+
+
 TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
+    "calibration": calibration,
     "maps_against_carla": carla,
     "maps_against_sumo": sumo,
     "maps_speed": speed,
+    "policies": policies,
     "soundness": soundness,
     "sweep_speed": sweep_speed,
     "traffic_against_sumo": traffic_sumo,

@@ -14,10 +14,20 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(train)
 
 
+def _check_folders(*files: Path | None) -> None:
+    """What cannot be written later is refused now."""
+    for file in files:
+        if file is not None and not file.parent.is_dir():
+            raise typer.BadParameter(f"{file}: there is no folder '{file.parent}'")
+
+
 def calibrate(
     data: Annotated[list[Path], typer.Argument(metavar="DATA...", help="Recordings of vehicles.")],
     model: Annotated[Literal["idm", "iidm", "acc"], typer.Option(help="Car-following model.")] = "idm",
-    objective: Annotated[str, typer.Option(help="What to make least: gap, mixed, log or speed.")] = "mixed",
+    objective: Annotated[
+        Literal["gap", "speed", "mixed", "log", "relative", "absolute"],
+        typer.Option(help="What to make least."),
+    ] = "mixed",
     method: Annotated[
         Literal["lm", "lbfgs", "adam", "de"], typer.Option(help="Optimiser; lm: Levenberg-Marquardt.")
     ] = "lm",
@@ -40,6 +50,7 @@ def calibrate(
     from limsim_jax.files import write_whole
     from limsim_jax.rollout import enable_compilation_cache
 
+    _check_folders(out, json_file)
     enable_compilation_cache()
     found = fit(data, model=model, objective=objective, method=method, shortest=shortest, seed=seed)
     print(found.text())
@@ -62,6 +73,9 @@ def train(
     from limsim_jax.rollout import enable_compilation_cache, use_all_cores
     from limsim_jax.training import train as fit
 
+    _check_folders(out)
+    if seeds < 1:
+        raise typer.BadParameter(f"{seeds} seeds; at least 1", param_hint="--seeds")
     use_all_cores()
     enable_compilation_cache()
     report = fit(out, seeds=seeds, epochs=epochs, policy=policy, tell=print)
