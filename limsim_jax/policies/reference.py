@@ -142,7 +142,7 @@ def beside(
     return (
         jnp.where(there, other, lane),
         jnp.where(there, other_s, s),
-        jnp.where(there, d - side * between, d),
+        jnp.where(there, d - side.astype(between.dtype) * between, d),
         there,
     )
 

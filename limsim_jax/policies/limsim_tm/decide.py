@@ -121,11 +121,11 @@ def grouped(
     candidates = jnp.where(counts[first], near[first], -1)  # [V K]
     planned = (candidates[:, :, None] == jnp.where(drives, slot, -2)[None, None]).any(-1)
     candidates = jnp.where(planned | (rows[:, :1] < 0), -1, candidates)
-    order = jnp.cumsum(candidates >= 0, -1) * (candidates >= 0)
+    order = jnp.where(candidates >= 0, jnp.cumsum(candidates >= 0, -1, dtype=jnp.int32), 0)
     places = []
     for k in range(group.SIZE):
         empty = members[:, k] < 0
-        nth = jnp.sum(members[:, : k + 1] < 0, -1)
+        nth = jnp.sum(members[:, : k + 1] < 0, -1, dtype=jnp.int32)
         pick = jnp.where(order == nth[:, None], candidates, -1).max(-1)
         places.append(jnp.where(empty & (nth > 0), pick, members[:, k]))
     return jnp.stack(places, -1)

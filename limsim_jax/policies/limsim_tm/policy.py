@@ -98,7 +98,7 @@ class LimSimTM:
             wish = jnp.where(now - since < 1e2, told.side, wish)
 
         # go on with a lane change until the middle of the body is on the other lane, as long as it is safe
-        side = jnp.where(side * d < -0.3, 0, side)
+        side = jnp.where(side.astype(d.dtype) * d < -0.3, 0, side)
         need = lane_map.routes.lanes_to_go[lane, goal]
         # a lane on that side may lead nowhere: the change may be possible only further on
         aside = jnp.where(need > 0, lane_map.left[lane], lane_map.right[lane])

@@ -1,0 +1,97 @@
+"""LimSim-TM in the engine: corridors of real lanes, and an ego that gets through traffic."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from traffic_worlds import bundled, drivers, shapes, state_of
+
+from limsim_jax.maps.lane_map import NO_LANE, lane_rows
+from limsim_jax.maps.routing import default_goals
+from limsim_jax.policies.limsim_tm import LimSimTM
+from limsim_jax.policies.limsim_tm.decide import corridor, grouped
+from limsim_jax.policies.limsim_tm.plan import room_needed
+from limsim_jax.policies.limsim_tm.search import Settings
+from limsim_jax.rollout import Rollout, one_world, trace
+from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, entries, sample_scenario
+from limsim_jax.traffic.engine import Traffic
+from limsim_jax.traffic.vehicles import default_population, fitting
+from limsim_jax.types import Config
+
+
+def entrance():
+    """Rows of the acceleration lane of the ramp and of the lanes to its left, and the goal straight on."""
+    network, lane_map = bundled("ramp")
+    goals = list(default_goals(network))
+    dead = [
+        row for row in lane_rows(network).values()
+        if bool(lane_map.valid[row]) and int(lane_map.successors[row, 0]) == NO_LANE
+        and int(lane_map.left[row]) != NO_LANE and float(lane_map.length[row]) > 200
+        and not bool(lane_map.routes.is_goal[row].any())
+    ]  # fmt: skip
+    lane = dead[0]
+    goal = next(g for g in range(len(goals)) if int(lane_map.routes.lanes_to_go[lane, g]) == 1)
+    return lane, int(lane_map.left[lane]), goal
+
+
+def test_a_corridor_knows_which_lanes_lead_on():
+    lane_map = bundled("ramp")[1]
+    lane, beside, goal = entrance()
+    rows, places = jnp.asarray([lane, beside]), jnp.asarray([40.0, 55.0])
+    found = corridor(lane_map, rows, places, jnp.full(2, goal), jnp.zeros(2, jnp.int32))
+    # the acceleration lane ends: one to the left, before its end
+    assert int(found.wanted_right[0]) == int(found.wanted_left[0]) == 1
+    assert int(found.left[0]) >= 1 and int(found.right[0]) == 0
+    np.testing.assert_allclose(found.to_go[0], lane_map.routes.change_distance[lane, goal] - 40.0)
+    # from beside it, nothing to the right leads on
+    assert int(found.wanted_right[1]) == 0 and int(found.right[1]) in (0, 1)
+
+
+def test_groups_take_in_neighbours_once():
+    lane = entrance()[1]
+    state = state_of("ramp", [lane] * 4, [60.0, 80.0, 100.0, 250.0], [20.0] * 4, [0] * 4)
+    lane_map = bundled("ramp")[1]
+    slot = jnp.asarray([0, 3, -1], jnp.int32)
+    near = jnp.asarray([[1, 2], [2, 1], [0, 1]], jnp.int32)
+    counts = jnp.asarray([[True, True], [False, False], [True, True]])
+    members = grouped(
+        lane_map, state, slot, slot >= 0, jnp.where(slot >= 0, lane, NO_LANE), jnp.zeros(3, jnp.int32),
+        state.s, 0 * state.s, near, counts,
+    )  # fmt: skip
+    np.testing.assert_array_equal(np.sort(members, -1), [[0, 1, 2], [-1, -1, 3], [-1, -1, -1]])
+
+
+def test_room_for_a_lane_change():
+    v = jnp.asarray([20.0, 20.0, 20.0])
+    ahead = jnp.asarray([20.0, 14.0, 30.0])
+    # to brake from 6 m/s more to the other's speed with 2 m/s^2 takes 9 m, and half a second of reaction 3 m
+    np.testing.assert_allclose(room_needed(v, ahead, 2.0, 0.3), [8.0, 8.0 + 3.0 + 9.0, 2.0])
+
+
+@functools.cache
+def runs():
+    """Two worlds of the roundabout with an ego that LimSim-TM drives."""
+    network, lane_map = bundled("roundabout")
+    flows = [Flow(origin=name, rate=350.0) for name in entries(network)]
+    population = fitting(default_population(), lane_map)
+    egos = EgoStart(driver=drivers(1), shape=shapes(1), free=jnp.asarray([True]))
+    demand = build_demand(
+        network, lane_map, default_goals(network), flows, population, horizon=30.0, density=4.0, egos=egos
+    )
+    policy = LimSimTM(search=Settings(simulations=10))
+    run = Rollout(Config(dt=0.1), Traffic(), 30.0, policy, record=trace)
+    sampler = lambda key: sample_scenario(demand, lane_map, key, 24, egos)  # noqa: E731
+    return jax.jit(jax.vmap(functools.partial(one_world, run, lane_map, sampler)))(jnp.asarray([0, 4]))
+
+
+def test_an_ego_gets_through_traffic():
+    result = runs()
+    v, status = np.asarray(result.trace.v[:, :, 0]), np.asarray(result.trace.status[:, :, 0])
+    assert not status.any()
+    assert not np.asarray(result.totals.collided).any()
+    assert (np.asarray(result.state.distance[:, 0]) > 100).all()
+    assert v.max() < 0.985 * 50 / 3.6 + 0.5  # keeps to the limit
+    a = np.asarray(result.trace.a[:, :, 0])
+    assert a.min() > -4.5 and a.max() < 3.0
+    assert np.isfinite(result.trace.box).all()
