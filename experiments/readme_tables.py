@@ -152,13 +152,6 @@ def sweep_speed(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
-def policies(result: dict[str, Any]) -> str:
-    """How well policies drive."""
-    from policies import table
-
-    return table(result["rows"])
-
-
 def calibration(result: dict[str, Any]) -> str:
     """How well drivers can be fitted."""
     rows = [
@@ -183,7 +176,6 @@ TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "maps_against_carla": carla,
     "maps_against_sumo": sumo,
     "maps_speed": speed,
-    "policies": policies,
     "soundness": soundness,
     "sweep_speed": sweep_speed,
     "traffic_against_sumo": traffic_sumo,
