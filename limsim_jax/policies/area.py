@@ -7,7 +7,7 @@ it is, at the speed and acceleration that it has.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -67,6 +67,8 @@ class AreaOfInterest:
         around = _named(self.around, self.options)
         if not around.free:
             raise ValueError("around: a policy that keeps to lanes; it needs one that moves in the plane")
+        if is_dataclass(around) and any(f.name == "others" for f in fields(around)):
+            around = replace(around, others=self.slots)  # the last rows are not egos
         object.__setattr__(self, "around", around)
         if self.ego is not None:
             object.__setattr__(self, "ego", _named(self.ego, {}))
@@ -94,19 +96,27 @@ class AreaOfInterest:
         fresh = slot != state.egos.slot
         state = assign(lane_map, state, boxes(lane_map, state), slot)
         # who is new in a place has no memory
-        begin = self._begin(config, lane_map, state)
-        inner = jax.tree.map(lambda new, old: _rows_where(fresh, new, old), begin, places.inner)
+        begin, rows = self._begin(config, lane_map, state), self._split(fresh)
+        inner = tuple(
+            jax.tree.map(lambda a, b: _rows_where(mine, a, b), new, old)  # noqa: B023
+            for mine, new, old in zip(rows, begin, places.inner, strict=True)
+        )
         command, inner = self._drive(config, lane_map, state, inner, key)
         return replace(command, slot=slot), places._replace(inner=inner)
 
     def _parts(self, state: State) -> list[tuple[Any, State]]:
         """The policies, and the rows of egos that each of them drives."""
+        policies = [self.around] if self.ego is None else [self.ego, self.around]
+        return [
+            (p, replace(state, egos=egos)) for p, egos in zip(policies, self._split(state.egos), strict=True)
+        ]
+
+    def _split(self, rows: Any) -> list[Any]:
+        """Arrays of all rows, as those of each policy."""
         if self.ego is None:
-            return [(self.around, state)]
-        count = state.egos.slot.shape[0] - self.slots
-        parts = (slice(None, count), slice(count, None))
-        rows = [jax.tree.map(lambda x: x[part], state.egos) for part in parts]  # noqa: B023
-        return [(p, replace(state, egos=egos)) for p, egos in zip((self.ego, self.around), rows, strict=True)]
+            return [rows]
+        egos = jax.tree.map(lambda x: x[: x.shape[0] - self.slots], rows)
+        return [egos, jax.tree.map(lambda x: x[x.shape[0] - self.slots :], rows)]
 
     def _begin(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         return tuple(policy.init(config, lane_map, some) for policy, some in self._parts(state))
@@ -141,6 +151,7 @@ class AreaOfInterest:
         last = lane_map.routes.is_goal[state.lane, state.goal]
         leaving = last & (lane_map.length[state.lane] - state.s < 3.0 * state.v + 10.0)
         fit = state.active & ~is_ego & ~leaving & ((state.status & int(Status.COLLIDED)) == 0)
+        fit &= ~(has & ~same[None]).any(-1)  # a slot whose vehicle has changed is free for one decision
         fit &= stays | ((state.side == 0) & (state.s > state.shape.length))
         leave = 1.3 * self.radius if self.leave is None else self.leave
         near = (away < self.radius) | (stays & (away < leave)) | young
@@ -179,11 +190,9 @@ def _named(policy: Policy | str, options: dict[str, Any]) -> Policy:
 
 
 def _rows_where(fresh: Bool[Array, " E"], new: Array, old: Array) -> Array:
-    """The new values in the rows of the last vehicles that are `fresh`; what has no such rows stays."""
-    rows = fresh.shape[0]
-    if new.ndim and 0 < new.shape[0] <= rows:
-        mask = fresh[rows - new.shape[0] :] if new.shape[0] != rows else fresh
-        return jnp.where(mask.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
+    """The new values in the rows that are `fresh`; what does not go by rows stays."""
+    if new.ndim and new.shape[0] == fresh.shape[0]:
+        return jnp.where(fresh.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
     return old
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.predict import Prediction
-from limsim_jax.policies.reference import Way
+from limsim_jax.policies.reference import Way, nearest_on
 from limsim_jax.traffic.ego import at_slots
 from limsim_jax.traffic.engine import Command, Decision, Traffic, decide
 from limsim_jax.types import Config, State
@@ -61,14 +61,8 @@ def around(state: State, prediction: Prediction, way: Way, slot: Int[Array, " V"
     near, index = lax.top_k(-away, min(count, number))
     there = near > -1e11
     ox, oy = x[index, 0], y[index, 0]
-    # the nearest point of the way
-    far = (ox[..., None] - way.x[:, None]) ** 2 + (oy[..., None] - way.y[:, None]) ** 2  # [V K M]
-    k = jnp.argmin(far, -1)
-    at = lambda table: jnp.take_along_axis(table, k, 1)  # noqa: E731
-    cos, sin = jnp.cos(at(way.heading)), jnp.sin(at(way.heading))
-    dx, dy = ox - at(way.x), oy - at(way.y)
-    s, d = k.astype(dx.dtype) * way.step + dx * cos + dy * sin, -dx * sin + dy * cos
-    turned = prediction.heading[index, 0] - at(way.heading)
+    s, d, along = nearest_on(way, ox, oy)
+    turned = prediction.heading[index, 0] - along
     half = (
         jnp.abs(jnp.cos(turned)) * state.shape.width[index]
         + jnp.abs(jnp.sin(turned)) * state.shape.length[index]

@@ -13,7 +13,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.geometry import wrap_angle
-from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, pose, side_s, width
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, neighbor, pose, side_s, width
 from limsim_jax.traffic.ego import body_place
 from limsim_jax.traffic.motion import lateral_speed
 from limsim_jax.types import State
@@ -135,7 +135,7 @@ def beside(
 
     Without such a lane, or with `side` 0, the place stays as it is.
     """
-    other = jnp.where(side > 0, lane_map.left[lane], lane_map.right[lane])
+    other, _ = neighbor(lane_map, lane, side)
     there = (side != 0) & (other != NO_LANE)
     other_s = side_s(lane_map, lane, s, side)
     between = (width(lane_map, lane, s) + width(lane_map, other, other_s)) / 2
@@ -215,3 +215,22 @@ def place_on(way: Way, s: Float[Array, "V ..."], d: Float[Array, "V ..."]) -> Pl
     y = y + rest * sin + d_ * cos
     bend = jnp.where(rest == 0, c0 + inside * (c1 - c0), 0)
     return Place(*(value.reshape(s.shape) for value in (x, y, heading, bend)))
+
+
+def nearest_on(
+    way: Way, x: Float[Array, "V ..."], y: Float[Array, "V ..."]
+) -> tuple[Float[Array, "V ..."], Float[Array, "V ..."], Float[Array, "V ..."]]:
+    """Where places are on each way: m along, m left of it, and the heading of the way there, rad.
+
+    Level with the nearest point of the way, so exact on straights and to half a step squared times the
+    curvature in bends.
+    """
+    flat = (x.shape[0], -1)
+    x_, y_ = x.reshape(flat), y.reshape(flat)
+    far = (x_[..., None] - way.x[:, None]) ** 2 + (y_[..., None] - way.y[:, None]) ** 2
+    k = jnp.argmin(far, -1)
+    heading = jnp.take_along_axis(way.heading, k, 1)
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
+    dx, dy = x_ - jnp.take_along_axis(way.x, k, 1), y_ - jnp.take_along_axis(way.y, k, 1)
+    s, d = k.astype(dx.dtype) * way.step + dx * cos + dy * sin, -dx * sin + dy * cos
+    return s.reshape(x.shape), d.reshape(x.shape), heading.reshape(x.shape)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, width
 from limsim_jax.policies.limsim_tm import group, search
 from limsim_jax.policies.predict import Prediction
-from limsim_jax.policies.reference import Way
+from limsim_jax.policies.reference import Way, nearest_on
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.types import State
 
@@ -35,7 +35,6 @@ class Told(NamedTuple):
     side: Int[Array, " V"]  # +1: change to the left, -1: to the right, 0: stay
     v: Float[Array, "V H"]  # m/s, at the moments of the search
     action: Int[Array, "V D"]  # `Meta`
-    value: Float[Array, " V"]  # utility, about 0..1
 
 
 class Corridor(NamedTuple):
@@ -149,12 +148,8 @@ def scene(
     """
     everybody = jnp.concatenate([member, jnp.where((near[:, None] == member[None]).any(-1), -1, near)])
     x, y = prediction.x[everybody], prediction.y[everybody]  # [G+K H]
-    far = (x[..., None] - way.x[0][None, None]) ** 2 + (y[..., None] - way.y[0][None, None]) ** 2
-    k = jnp.argmin(far, -1)
-    cos, sin = jnp.cos(way.heading[0])[k], jnp.sin(way.heading[0])[k]
-    dx, dy = x - way.x[0][k], y - way.y[0][k]
-    s, d = k.astype(x.dtype) * way.step + dx * cos + dy * sin, -dx * sin + dy * cos
-    turned = jnp.cos(prediction.heading[everybody] - way.heading[0][k])
+    s, d, along = (found[0] for found in nearest_on(way, x[None], y[None]))
+    turned = jnp.cos(prediction.heading[everybody] - along)
     s = s + state.shape.length[everybody][:, None] / 2  # fronts
     count = member.shape[0]
     breadth = width(lane_map, lane[member[0]], state.s[member[0]])
@@ -241,7 +236,6 @@ def tell(
         side=jnp.where(found & ~pick(plans.crashed), jnp.clip(turn, -1, 1), 0),
         v=pick(plans.v),
         action=pick(plans.action),
-        value=pick(plans.value),
     )
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.maps.lane_map import NO_LANE, LaneMap
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, neighbor
 from limsim_jax.policies.limsim_tm.decide import Told, grouped, neighbours, tell
 from limsim_jax.policies.limsim_tm.plan import Lattice, Merge, Others, Task, plan, room_needed
 from limsim_jax.policies.limsim_tm.search import Settings, no_plan, shifted
@@ -67,7 +67,6 @@ class LimSimTM:
             side=jnp.zeros(rows, jnp.int32),
             v=jnp.full((rows, size.steps + 1), _ANY_SPEED),
             action=no_plan(rows, size.decisions),
-            value=jnp.zeros(rows),
         )
         return Memory(state.egos.slot, jnp.zeros_like(state.egos.slot), told, jnp.full(rows, -1e3))
 
@@ -101,7 +100,7 @@ class LimSimTM:
         side = jnp.where(side.astype(d.dtype) * d < -0.3, 0, side)
         need = lane_map.routes.lanes_to_go[lane, goal]
         # a lane on that side may lead nowhere: the change may be possible only further on
-        aside = jnp.where(need > 0, lane_map.left[lane], lane_map.right[lane])
+        aside, _ = neighbor(lane_map, lane, jnp.sign(need))
         need = jnp.where(self._leads_on(lane_map, state, slot, lane, aside, s), need, 0)
         room = lane_map.routes.change_distance[lane, goal] - s
         press = urgency(need, room, state.v[slot], state.driver.lane_change_time[slot])
@@ -134,7 +133,7 @@ class LimSimTM:
             jnp.where(there & (look * need > 0) & ~changes, jnp.clip(press, 0.2, 1.0), 0.0),
         )  # fmt: skip
         task = self._task(
-            state, decision, way, slot, d, found, prediction, merge, self._speed(told, now - since)
+            state, decision, way, slot, d, found, prediction, wall, merge, self._speed(told, now - since)
         )
         chosen = plan(self.lattice, self.traffic.model, task)
         trajectory = Trajectory(
@@ -177,9 +176,7 @@ class LimSimTM:
         self, lane_map: LaneMap, state: State, slot: Array, lane: Array, side: Int[Array, " V"]
     ) -> Bool[Array, " V"]:
         """Whether marks and vehicle class allow the change, outside junctions."""
-        left = side > 0
-        allowed = jnp.where(left, lane_map.may_change_left[lane], lane_map.may_change_right[lane])
-        other = jnp.where(left, lane_map.left[lane], lane_map.right[lane])
+        other, allowed = neighbor(lane_map, lane, side)
         usable = ((lane_map.access[other] >> state.shape.vehicle_class[slot]) & 1) == 1
         allowed &= usable & ~lane_map.is_connector[lane] & (state.lane[slot] == lane)
         return allowed & self._leads_on(lane_map, state, slot, lane, other, state.s[slot])
@@ -233,6 +230,7 @@ class LimSimTM:
         d: Array,
         found: Around,
         prediction: Prediction,
+        wall: Array,
         merge: Merge,
         wanted: Array,
     ) -> Task:
@@ -261,7 +259,7 @@ class LimSimTM:
             driver=driver,
             lead_gap=lead_gap,
             lead_v=lead_v,
-            wall=jnp.minimum(decision.obstacles.gap[slot, -1] - driver.s0, NO_GAP),
+            wall=wall[slot],
             other=Others(
                 prediction.x[found.slot], prediction.y[found.slot], prediction.heading[found.slot],
                 state.shape.length[found.slot], state.shape.width[found.slot], found.there & ~follows,
