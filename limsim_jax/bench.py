@@ -1,4 +1,4 @@
-"""How fast maps load, lanes are looked up and traffic runs, on this machine.
+"""How fast maps load, lanes are looked up, traffic runs and policies decide, on this machine.
 
 Everything is timed in processes of its own: a cold start is then really cold, and on one core even the
 threads of XLA have only that core.
@@ -137,6 +137,57 @@ def bench_traffic(
     return result
 
 
+def bench_policy(
+    experiment: str, policy: str | None = None, *, worlds: int = 64, repeats: int = 5, cold: bool = False
+) -> dict[str, Any]:
+    """Time the decisions of an experiment's policy alone: of one world on one core, and of many on all.
+
+    Args:
+      experiment: file, or one that comes along.
+      policy: instead of the experiment's.
+      worlds: of the batch.
+      repeats: runs of which the median counts.
+      cold: compile with an empty cache; else the user's cache is used.
+
+    Returns:
+      `latency_s`: of a call for one world from the host, on one core or on the accelerator;
+      `amortised_s`: per planned vehicle and decision in the batch, on all cores; both with `_compile_s`;
+      `planned`: vehicles that the policy plans for in a world.
+    """
+    told = {"policy": policy, "repeats": repeats}
+    with tempfile.TemporaryDirectory(prefix="limsim-jax-bench-") as folder:
+        cache = folder if cold else None
+        one, many = (
+            _child("policy", experiment, json.dumps(told | {"worlds": count}), cores=cores, cache=cache)
+            for count, cores in ((1, _cores()[:1]), (worlds, _cores()))
+        )
+    return {name: many[name] for name in ("scenario", "policy", "device", "platform", "cores", "planned")} | {
+        "worlds": many["worlds"],
+        "latency_s": one["call_s"],
+        "latency_compile_s": one["compile_s"],
+        "amortised_s": many["call_s"] / (many["worlds"] * max(many["planned"], 1)),
+        "amortised_compile_s": many["compile_s"],
+    }
+
+
+def policy_lines(result: dict[str, Any]) -> list[tuple[str, str]]:
+    """The result of `bench_policy` as names and values to print."""
+    r = result
+    return [
+        ("policy", f"{r['policy']} in {r['scenario']}, {r['planned']} planned vehicles per world"),
+        ("device", f"{r['device']}, {r['cores']} cores"),
+        ("one decision", f"{1e3 * r['latency_s']:.2f} ms for one world, one core"),
+        (
+            "amortised",
+            f"{1e3 * r['amortised_s']:.3f} ms per planned vehicle, {r['worlds']} worlds, all cores",
+        ),
+        (
+            "compile",
+            f"{r['latency_compile_s']:.1f} s for one world, {r['amortised_compile_s']:.1f} s for many",
+        ),
+    ]
+
+
 def build_traffic(
     network: Network, lane_map: LaneMap, *, rate: float, vehicles: int, seconds: float
 ) -> tuple[Demand, int]:
@@ -271,6 +322,7 @@ def _main(cores: str, stage: str, path: str, *options: str) -> int:
         "cached": _cached,
         "look_ups": _look_ups,
         "traffic": _traffic,
+        "policy": _policy,
         "sumo": _sumo,
     }
     try:
@@ -432,6 +484,64 @@ def _traffic(path: str, told: str) -> dict[str, Any]:
         "vehicle_updates_per_s": statistics.median(rates),
         "slot_updates_per_s": many.chunk * slots * steps / run_s,
         "world_steps_per_s": many.chunk * steps / run_s,
+    }
+
+
+def _policy(experiment: str, told: str) -> dict[str, Any]:
+    """Time decisions of a policy at the start of the worlds of an experiment."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    from jax.sharding import Mesh, PartitionSpec
+
+    from limsim_jax.rollout import compiler_options, enable_compilation_cache, use_all_cores, world_key
+    from limsim_jax.sweep.episode import Episodes
+    from limsim_jax.sweep.experiment import read_experiments
+
+    options = json.loads(told)
+    use_all_cores()
+    enable_compilation_cache()
+    (read,) = read_experiments(experiment, policy=options["policy"])
+    episodes = Episodes(read)
+    run, lane_map = episodes._run, episodes.lane_map
+    devices = jax.local_devices()[: options["worlds"]]
+    worlds = -(-options["worlds"] // len(devices)) * len(devices)
+    mesh, axis = Mesh(np.array(devices), ("worlds",)), PartitionSpec("worlds")
+
+    def over_worlds(one: Callable[..., Any], count: int) -> Callable[..., Any]:
+        many = jax.vmap(one, in_axes=(None, *[0] * count))
+        specs = (PartitionSpec(), *[axis] * count)
+        return jax.shard_map(many, mesh=mesh, in_specs=specs, out_specs=axis, check_vma=False)
+
+    def begin(lane_map: Any, seed: Any) -> Any:
+        carry = run.begin(lane_map, episodes._sample(world_key(seed)).start)
+        return carry.state, carry.memory
+
+    def decide(lane_map: Any, state: Any, memory: Any, seed: Any) -> Any:
+        return run.policy(run.config, lane_map, state, memory, world_key(seed))
+
+    seeds = jnp.arange(worlds, dtype=jnp.int32)
+    state, memory = jax.block_until_ready(jax.jit(over_worlds(begin, 1))(lane_map, seeds))
+    start = time.perf_counter()
+    made = jax.jit(over_worlds(decide, 3), compiler_options=compiler_options())
+    compiled = made.lower(lane_map, state, memory, seeds).compile()
+    compile_s = time.perf_counter() - start
+    runs = []
+    for _ in range(10 * options["repeats"] + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(compiled(lane_map, state, memory, seeds))
+        runs.append(time.perf_counter() - start)
+    device = jax.devices()[0]
+    return {
+        "scenario": read.name,
+        "policy": read.policy,
+        "device": _processor() if device.platform == "cpu" else device.device_kind,
+        "platform": device.platform,
+        "cores": len(_cores()) or os.cpu_count(),
+        "planned": state.egos.slot.shape[1],
+        "worlds": worlds,
+        "call_s": statistics.median(runs[1:]),
+        "compile_s": compile_s,
     }
 
 

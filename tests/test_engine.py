@@ -12,6 +12,7 @@ from traffic_worlds import bundled, drivers, scattered, shapes, state_of
 from limsim_jax.geometry import box_separation
 from limsim_jax.maps.lane_map import lane_rows, width
 from limsim_jax.traffic.car_following import ACC, IDM
+from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.engine import Traffic, drive
 from limsim_jax.traffic.lane_change import incentive, urgency
 from limsim_jax.traffic.motion import boxes, smooth_step
@@ -121,6 +122,22 @@ def test_a_platoon_settles_at_the_equilibrium_gap(model, exact):
     if not exact:  # IDM: (s0 + v T) / sqrt(1 - (v / v0)^4)
         expected = expected / np.sqrt(1 - (20.0 / free) ** 4)
     np.testing.assert_allclose(gap, expected, atol=0.15)
+
+
+def test_worlds_without_free_egos_need_no_bicycle_model():
+    """Left out, it changes nothing: not a bit."""
+    _, lane_map = bundled("intersection")
+    state = scattered("intersection", 12, 5, v=8.0)
+    state = dataclasses.replace(state, egos=from_lane(lane_map, state, boxes(lane_map, state), [3], False))
+
+    def run(free, state):
+        step = lambda state, _: drive(CONFIG, Traffic(), lane_map, state, free=free)  # noqa: E731
+        return jax.lax.scan(step, state, None, length=8)[0]
+
+    ends = [jax.jit(run, static_argnums=0)(free, state) for free in (True, False)]
+    for one, other in zip(*map(jax.tree.leaves, ends), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert float(ends[0].distance[3]) > float(state.distance[3]) + 1
 
 
 def test_slots_may_be_permuted():

@@ -113,6 +113,15 @@ def test_traffic_starts_with_the_vehicles_asked_for(vehicles):
     assert (demand.initial, origins) == (vehicles, 4)
 
 
+def test_a_policy_is_timed():
+    found = bench.bench_policy("roundabout", "constant_speed", worlds=3, repeats=1)
+    assert found["worlds"] in (3, 4) and found["planned"] == 1 and found["policy"] == "constant_speed"
+    assert 0 < found["latency_s"] < 1 and 0 < found["amortised_s"] < 1
+    lines = dict(bench.policy_lines(found))
+    assert lines["policy"] == "constant_speed in roundabout, 1 planned vehicles per world"
+    assert f"{1e3 * found['latency_s']:.2f} ms" in lines["one decision"]
+
+
 def test_bench_lines_say_why_there_is_no_peer():
     result = {
         "map": "a.xodr", "worlds": 2, "vehicles": 8, "steps": 10, "dt": 0.1, "device": "cpu", "devices": 1,

@@ -348,6 +348,34 @@ def traffic(
 
 
 @bench_app.command()
+def policy(
+    experiment: Annotated[str, typer.Argument(help="Experiment file, or the name of one.")],
+    name: Annotated[
+        str | None, typer.Option("--policy", metavar="NAME", help="Instead of the experiment's.")
+    ] = None,
+    worlds: Annotated[int, typer.Option(min=1, help="Worlds of the batch.")] = 64,
+    repeats: Annotated[int, typer.Option(min=1, help="Tens of calls of which the median counts.")] = 5,
+    cold: Annotated[bool, typer.Option("--cold", help="Compile with an empty cache.")] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Time the decisions of a policy: of one world on one core, and of many on all."""
+    from limsim_jax.bench import bench_policy, policy_lines
+    from limsim_jax.sweep.episode import Episodes
+    from limsim_jax.sweep.experiment import read_experiments
+
+    if json_file is not None:
+        _check_writable(json_file)
+    read = read_experiments(experiment, policy=name)
+    if len(read) != 1:
+        raise typer.BadParameter(f"'{experiment}' is {len(read)} experiments; name one of them")
+    Episodes(read[0])  # says what is wrong with it
+    result = bench_policy(experiment, name, worlds=worlds, repeats=repeats, cold=cold)
+    if json_file is not None:
+        _write_json(json_file, result)
+    _table(policy_lines(result))
+
+
+@bench_app.command()
 def maps(
     file: Annotated[
         str, typer.Argument(metavar="[FILE]", help="Map file or the name of a bundled map.")

@@ -38,6 +38,7 @@ from limsim_jax.rollout import (
     Totals,
     Trace,
     Worlds,
+    compiler_options,
     enable_compilation_cache,
     one_world,
     trace,
@@ -261,7 +262,7 @@ class Episodes:
             return one_world(run, lane_map, self._sample, seed)
 
         enable_compilation_cache()
-        return jax.jit(one)
+        return jax.jit(one, compiler_options=compiler_options())
 
 
 class _Braking:

@@ -262,6 +262,8 @@ def drive(
     schedule: Schedule | None = None,
     command: Command | None = None,
     record: Callable[[Tick], Any] | None = None,
+    *,
+    free: bool = True,
 ) -> tuple[State, Any]:
     """One decision and the physics steps up to the next.
 
@@ -273,6 +275,7 @@ def drive(
       schedule: who may enter; nobody if None.
       command: of the egos.
       record: its results are stacked over the steps, `[decision_every, ...]`.
+      free: egos may leave their lanes; False is for worlds without free egos, and compiles faster.
 
     Raises:
       ValueError: an unknown `after_collision` or `look_for_contacts`.
@@ -298,7 +301,7 @@ def drive(
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], Any]:
         state, x = carry
         state = replace(state, **fixed)
-        state, dx, left = _step(config, traffic, lane_map, state, decision, x, command)
+        state, dx, left = _step(config, traffic, lane_map, state, decision, x, command, free)
         x = x + dx
         tick = Tick(state, left, config.time(state.step), decision, x, dx)
         return (bare(state), x), None if record is None else record(tick)
@@ -321,6 +324,7 @@ def _step(
     decision: Decision,
     x: Float[Array, " N"],
     command: Command,
+    may_be_free: bool,
 ) -> tuple[State, Float[Array, " N"], Bool[Array, " N"]]:
     """One physics step, `x` m after the decision: the state, the metres travelled, who has left."""
     egos = state.egos
@@ -332,7 +336,7 @@ def _step(
         a = jnp.where(command.brake, -state.driver.b_max, a)
     a = after_collision(state, a, traffic.after_collision)
     free = None
-    if egos.slot.shape[0]:
+    if may_be_free and egos.slot.shape[0]:
         if command.trajectory is not None:
             now = config.time(state.step)
             control = track(config, traffic.limits, state, command.trajectory, now)

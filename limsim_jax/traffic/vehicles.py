@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES, LaneMap
 from limsim_jax.maps.network import MapError
 from limsim_jax.maps.sumo_demand import VehicleType
+from limsim_jax.numerics import computed_once
 from limsim_jax.types import Driver, Shape
 
 BODY = ("length", "width", "wheelbase")
@@ -99,7 +100,7 @@ def sample(
     deviate = math.sqrt(2) * erf_inv(jnp.clip(2 * quantile - 1, -1 + 1e-6, 1 - 1e-6))  # within 4.9
     x = scale(median) + spread * deviate
     x = jnp.clip(jnp.where(_IS_NORMAL, x, jnp.exp(x)), lower, upper)
-    values = dict(zip(PARAMETERS, x, strict=True))
+    values = dict(zip(PARAMETERS, computed_once(x), strict=True))
     body = {name: values.pop(name) for name in BODY}
     return Driver(**values), Shape(**body, vehicle_class=population.vehicle_class[vehicle_type])
 
