@@ -56,8 +56,8 @@ def measure(policy: str, scenario: str, seeds: int) -> dict[str, Any]:
 
 def latency(episodes: Episodes) -> float:
     """Median time of one decision of one world, ms: a call of the policy alone, compiled, from the host."""
-    run, lane_map = episodes._run, episodes.lane_map
-    scenario = jax.jit(episodes._sample)(world_key(0))
+    run, lane_map = episodes.rollout, episodes.lane_map
+    scenario = jax.jit(episodes.sample)(world_key(0))
     carry = jax.jit(lambda state: run.begin(lane_map, state))(scenario.start)
     decide = jax.jit(lambda state, memory, key: run.policy(run.config, lane_map, state, memory, key))
     times = []

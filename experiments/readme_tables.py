@@ -171,11 +171,56 @@ def calibration(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def closed_loop(result: dict[str, Any]) -> str:
+    """What is left of the default population's distances on held-out periods."""
+    rows = [
+        "| recordings | headway | speed | gap | flow |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for one in result.values():
+        if "left_of_default" not in one:
+            continue
+        before, after, halves = (
+            one["held_out"]["default"],
+            one["held_out"]["closed_loop"],
+            one["floor"]["held_out"],
+        )
+        cells = [
+            f"{100 * one['left_of_default'][name]:.0f} %: {before[name]:.3g} to {after[name]:.3g} {unit} "
+            f"({halves[name]:.3g})"
+            for name, unit in (("headway", "s"), ("speed", "m/s"), ("gap", "m"), ("flow", "veh/h"))
+        ]
+        rows.append(f"| {one['title']} | {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def policies(result: dict[str, Any]) -> str:
+    """Scenarios and policies, with intervals."""
+    paper = {"highway": 76.3, "ramp": 64.6, "intersection": 86.3, "roundabout": 72.1, "long_route": 78.8}
+    rows = [
+        "| scenario | policy | seeds | success, % | route completion, % | LimSim driving score "
+        "| contact at fault, % | decision, ms |",
+        "|---|---|---:|---|---:|---|---|---:|",
+    ]
+    for r in result["rows"]:
+        (success, low, high), (score, least, most) = ([100 * x for x in r["success"]], r["score"])
+        fault, _, bound = (100 * x for x in r["at_fault_contacts"])
+        theirs = f" ({paper[r['scenario']]})" if r["policy"] == "limsim_tm" else ""
+        rows.append(
+            f"| {r['scenario']} | {r['policy']} | {r['seeds']:,} | {success:.1f} [{low:.1f}, {high:.1f}] "
+            f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}]{theirs} "
+            f"| {fault:.1f} (at most {bound:.1f}) | {r['decision_ms']:.1f} |"
+        )
+    return "\n".join(rows)
+
+
 TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "calibration": calibration,
+    "closed_loop": closed_loop,
     "maps_against_carla": carla,
     "maps_against_sumo": sumo,
     "maps_speed": speed,
+    "policies": policies,
     "soundness": soundness,
     "sweep_speed": sweep_speed,
     "traffic_against_sumo": traffic_sumo,

@@ -503,7 +503,7 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
     enable_compilation_cache()
     (read,) = read_experiments(experiment, policy=options["policy"])
     episodes = Episodes(read)
-    run, lane_map = episodes._run, episodes.lane_map
+    run, lane_map = episodes.rollout, episodes.lane_map
     devices = jax.local_devices()[: options["worlds"]]
     worlds = -(-options["worlds"] // len(devices)) * len(devices)
     mesh, axis = Mesh(np.array(devices), ("worlds",)), PartitionSpec("worlds")
@@ -514,7 +514,7 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
         return jax.shard_map(many, mesh=mesh, in_specs=specs, out_specs=axis, check_vma=False)
 
     def begin(lane_map: Any, seed: Any) -> Any:
-        carry = run.begin(lane_map, episodes._sample(world_key(seed)).start)
+        carry = run.begin(lane_map, episodes.sample(world_key(seed)).start)
         return carry.state, carry.memory
 
     def decide(lane_map: Any, state: Any, memory: Any, seed: Any) -> Any:

@@ -29,7 +29,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from limsim_jax.files import write_whole
 from limsim_jax.maps.cache import directory
-from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap
+from limsim_jax.maps.routing import FAR
 from limsim_jax.numerics import mapped_like
 from limsim_jax.policies.base import LikeTraffic, Policy
 from limsim_jax.traffic.collision import collided
@@ -105,7 +106,11 @@ class Measure(Protocol):
 
 
 class Trace(NamedTuple):
-    """The standard record of a step, for `N` slots."""
+    """The standard record of a step, for `N` slots and `E` rows of `Egos`.
+
+    What is None is not known: nothing of egos in a world without, no plans of a policy that gives no
+    trajectories.
+    """
 
     time: Float[Array, ""]  # s
     active: Bool[Array, " N"]
@@ -118,6 +123,11 @@ class Trace(NamedTuple):
     box: Float[Array, "N 5"]  # x, y (m), heading (rad), length, width (m)
     status: Int[Array, " N"]
     phase: Int[Array, " P"]  # of the signal programs
+    vehicle_class: Int[Array, " N"] | None = None  # row of `maps.lane_map.VEHICLE_CLASSES`
+    driven: Int[Array, " E"] | None = None  # slot that the policy drives, egos first; -1: nobody
+    to_go: Float[Array, ""] | None = None  # m of the first ego to its goal (`routes.distance`); NaN: none
+    plan: Float[Array, "E H 2"] | None = None  # m, x and y planned at the decision; NaN: no trajectory
+    plan_time: Float[Array, " H"] | None = None  # s, when
 
 
 def trace(lane_map: LaneMap) -> Callable[[Tick], Trace]:
@@ -125,6 +135,9 @@ def trace(lane_map: LaneMap) -> Callable[[Tick], Trace]:
 
     def record(tick: Tick) -> Trace:
         state = tick.state
+        some = state.egos.slot.shape[0] > 0
+        driven = jnp.where(state.active[state.egos.slot], state.egos.slot, -1) if some else None
+        plan, plan_time = _plan(tick, driven)
         return Trace(
             time=tick.time,
             active=state.active,
@@ -137,9 +150,33 @@ def trace(lane_map: LaneMap) -> Callable[[Tick], Trace]:
             box=boxes(lane_map, state),
             status=state.status,
             phase=state.lights.phase,
+            vehicle_class=state.shape.vehicle_class,
+            driven=driven,
+            to_go=_to_go(lane_map, state) if some else None,
+            plan=plan,
+            plan_time=plan_time,
         )
 
     return record
+
+
+def _plan(tick: Tick, driven: Int[Array, " E"] | None) -> tuple[Array | None, Array | None]:
+    """Trajectories of those that follow one, and the times of their samples (s)."""
+    planned, egos = tick.command.trajectory, tick.state.egos
+    if planned is None or driven is None:
+        return None, None
+    follows = (egos.free & (driven >= 0))[:, None, None]
+    plan = jnp.where(follows, jnp.stack([planned.x, planned.y], -1), jnp.nan)
+    return plan, planned.t0 + planned.dt * jnp.arange(plan.shape[1], dtype=plan.dtype)
+
+
+def _to_go(lane_map: LaneMap, state: State) -> Float[Array, ""]:
+    """Metres from the front bumper of the first ego to the end of its goal; NaN: gone, or no way there."""
+    slot = state.egos.slot[0]
+    lane = state.lane[slot]
+    distance = lane_map.routes.distance[lane, state.goal[slot]]
+    known = state.active[slot] & (lane != NO_LANE) & (distance < FAR)
+    return jnp.where(known, jnp.maximum(distance - state.s[slot], 0), jnp.nan)
 
 
 @dataclass(frozen=True)

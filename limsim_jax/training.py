@@ -149,7 +149,7 @@ def record(
     parts: list[Samples] = []
     for told in read_experiments(experiment, policy=policy):
         episodes = Episodes(told, chunk=chunk)
-        run = episodes._run
+        run = episodes.rollout
         if abs(run.config.decision_time - POSE_TIME) > 1e-6:
             raise ValueError(
                 f"{told.name}: decisions every {run.config.decision_time} s; training needs {POSE_TIME} s"
@@ -158,7 +158,7 @@ def record(
 
         def one(lane_map: LaneMap, seed: jax.Array, run: Any = run, episodes: Any = episodes) -> _Memory:
             scenario_key, key = jax.random.split(world_key(seed))
-            scenario = episodes._sample(scenario_key)
+            scenario = episodes.sample(scenario_key)
             carry = run.begin(lane_map, scenario.start)
             return run.go_on(lane_map, scenario.schedule, key, carry)[1].memory
 

@@ -10,7 +10,7 @@ import pytest
 from traffic_worlds import bundled, drivers, scattered, shapes, state_of
 
 from limsim_jax.geometry import box_separation
-from limsim_jax.maps.lane_map import lane_rows, width
+from limsim_jax.maps.lane_map import curvature, lane_rows, width
 from limsim_jax.traffic.car_following import ACC, IDM
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.engine import Traffic, drive
@@ -93,6 +93,24 @@ def test_lane_ends_and_exits_are_reached_without_overlap():
     assert float(trace["apart"].min()) > 0
     assert int(end.active.sum()) == 0
     assert float(trace["a"].min()) >= -8.001
+
+
+def test_a_bend_ahead_is_reached_at_the_speed_that_it_allows():
+    """Nobody is in the way: at 50 km/h towards the roundabout, whose entry bends with 12 m radius."""
+    network, lane_map = bundled("roundabout")
+    row = lane_rows(network)["1_0_-3"]
+    goal = int(np.nonzero(np.asarray(lane_map.routes.reachable)[row])[0][-1])
+    driver = drivers(1, a_lat=2.5, b=2.0)
+    start = float(lane_map.length[row]) - 80.0
+    _, trace = runner("roundabout", Traffic(), 30)(
+        state_of("roundabout", [row], [start], [13.9], [goal], driver=driver)
+    )
+    lane, s, v = (trace[name][:, 0] for name in ("lane", "s", "v"))
+    bend = jax.jit(jax.vmap(lambda lane, s: curvature(lane_map, lane, s)))(lane, s)
+    lateral = np.asarray(v * v * jnp.abs(bend))
+    assert (np.asarray(lane) != row).any() and lateral.max() > 2.0
+    assert lateral.max() < 2.5 * 1.15
+    assert float(trace["a"].min()) > -2.1
 
 
 def platoon(model, n=6, v=20.0):

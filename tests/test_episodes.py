@@ -156,7 +156,8 @@ def rows(**columns):
     """Two worlds in which nothing is measured but what is told."""
     names = (
         "contact_time contact_delta_v contact_other contact_responsibility off_road_time off_road "
-        "red_light_time red_lights min_ttc_time min_ttc max_drac_time max_drac rss_first_time"
+        "red_light_time red_lights min_ttc_time min_ttc max_drac_time max_drac rss_first_time "
+        "worst_second_time worst_second"
     ).split()
     nothing = {name: np.array([np.nan, np.nan]) for name in names}
     return nothing | {name: np.array(values, float) for name, values in columns.items()}
@@ -171,6 +172,7 @@ def test_key_moments_are_ranked():
             contact_responsibility=[nan, 1], min_ttc_time=[3.0, 11.9], min_ttc=[1.2, 0.0],
             max_drac_time=[5.0, 4.0], max_drac=[3.3, 4.4], rss_first_time=[2.0, nan],
             off_road_time=[nan, 13.0], off_road=[0, 0.1],
+            worst_second_time=[8.0, 9.0], worst_second=[50.0, 49.5],
         ),
     )  # fmt: skip
     table = list(zip(*(found[name].tolist() for name in ("seed", "rank", "kind", "time")), strict=True))
@@ -180,8 +182,9 @@ def test_key_moments_are_ranked():
         (9, 1, "contact", 12.0),
         (9, 2, "off_road", 13.0),
         (9, 3, "hard_brake", 4.0),  # the near miss is that contact
+        (9, 4, "score_drop", 9.0),
     ]
-    assert found["responsible"].tolist() == [None, None, "ego", None, None]
+    assert found["responsible"].tolist() == [None, None, "ego", None, None, None]
     assert found["other"].tolist()[2] == 4 and found["value"].tolist()[2] == 6.5
 
 

@@ -49,7 +49,7 @@ def test_the_ego_starts_where_the_file_says_and_nobody_is_on_top_of_it(name):
     (experiment,) = read_experiments(name)
     episodes = Episodes(experiment)
     network, _ = bundled(name)
-    scenario = jax.jit(jax.vmap(episodes._sample))(jax.random.split(jax.random.key(1), 8))
+    scenario = jax.jit(jax.vmap(episodes.sample))(jax.random.split(jax.random.key(1), 8))
     start = jax.device_get(scenario.start)
     ids = lane_ids(network)
     lane = network.lanes[ids[start.lane[0, 0]]]
@@ -70,7 +70,7 @@ def test_an_ego_with_a_random_start_is_elsewhere_in_every_world(write):
     text = GOOD.replace('start = "6-"\ns = 60.0\ngoal = "2"', 'start = "random"')
     (experiment,) = read_experiments(write(text))
     episodes = Episodes(experiment)
-    start = jax.device_get(jax.jit(jax.vmap(episodes._sample))(jax.random.split(jax.random.key(1), 8)).start)
+    start = jax.device_get(jax.jit(jax.vmap(episodes.sample))(jax.random.split(jax.random.key(1), 8)).start)
     assert len({(int(a), float(b)) for a, b in zip(start.lane[:, 0], start.s[:, 0], strict=True)}) == 8
     assert (start.active.sum(-1) == 6).all(), "the ego is one of those at the start"
     assert (start.shape.length[:, 0] == start.shape.length[0, 0]).all(), "but always the same car"

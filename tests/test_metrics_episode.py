@@ -212,10 +212,21 @@ def test_who_is_not_relevant_or_not_there_is_not_met():
     found = measure(r)
     assert found["min_ttc"] is None and found["nuplan_ttc"] == 1.0
     assert found["min_distance"] == pytest.approx(15.0, abs=1e-4)  # a distance it is
+    r["changing"][10, 0] = True  # then the ego leaves its lane for a moment
+    assert measure(r)["min_ttc_2d"] == pytest.approx(measure(closing())["min_ttc_2d"] + 2.0, abs=1e-3)
     r = closing()
     r["active"][:, 1] = False
     found = measure(r)
     assert found["min_ttc"] is found["min_thw"] is found["min_distance"] is None
+
+
+def test_who_touches_is_met_whatever_way_it_meant_to_go():
+    r = record(31, (0, 0, 0, 10.0), [(30, 0, 0, 0.0)])
+    assert measure(r)["contacts"] == 1.0
+    r["relevant"][:, 1] = False
+    found = measure(r)
+    assert found["contacts"] == 1.0 and found["min_ttc"] == 0.0
+    assert found["min_ttc_time"] == found["contact_time"]
 
 
 def test_near_misses_are_episodes():

@@ -181,15 +181,20 @@ def comfort(a, lateral, jerk, lateral_jerk):
     return np.where(np.asarray(a) > 0, ahead, braking), pieces(lateral, (0.9, 4, 5.6)), *jerks
 
 
-def drive(record, success=True, completion=1.0, failed=False):
-    """Both scores of a record: arrays with one value per step, the first of which is the start."""
+def drive(*args, **kwargs):
+    """Both scores of a record, see `judged`."""
+    return judged(*args, **kwargs)[:2]
+
+
+def judged(record, success=True, completion=1.0, failed=False):
+    """Both scores of a record, and its worst second; arrays have a value per step, the start first."""
     names = ("v", "v_others", "others", "limit", "ttc", "red_light", "in_junction", "waits_at_red")
 
     def step(carry, x):
         motion, limsim = carry
         t, heading, a, values = x
         motion, filtered = motion_update(DT, motion, t=t, v=values["v"], a=a, heading=heading)
-        limsim = limsim_update(DT, limsim, filtered, a=a, lateral=motion.lateral, **values)
+        limsim = limsim_update(DT, limsim, filtered, t=t, a=a, lateral=motion.lateral, **values)
         return (motion, limsim), None
 
     @jax.jit
@@ -200,6 +205,7 @@ def drive(record, success=True, completion=1.0, failed=False):
         return (
             limsim_faithful(limsim, success=flag(success), **ends),
             limsim_corrected(limsim, rest, failed=flag(failed), **ends),
+            limsim.worst,
         )
 
     n = len(record["v"])
@@ -228,7 +234,7 @@ def record(n, seed=None):
 def test_limsim_streams_are_loops_over_the_record():
     n = 64  # the start, six seconds, and three steps that do not count
     r = record(n, 0)
-    faithful, corrected = drive(r, success=False, completion=0.7, failed=True)
+    faithful, corrected, worst = judged(r, success=False, completion=0.7, failed=True)
     lateral = np.concatenate([[0.0], r["v"][1:] * np.diff(r["heading"]) / DT])
     c, e, ec, s, speeding, reds = [], [], [], [], [], 0
     for k in range(6):
@@ -244,6 +250,9 @@ def test_limsim_streams_are_loops_over_the_record():
         speeding.append(r["v"][w].max() > r["limit"][end])
         reds += r["red_light"][w].any() and r["in_junction"][end]
     assert 0 < reds < r["red_light"][1:61].sum()
+    seconds = 100 * (0.25 * np.array(c) + 0.25 * np.array(ec) + 0.5 * np.array(s))
+    assert float(worst.value) == pytest.approx(seconds.min(), rel=1e-4)
+    assert float(worst.time) == pytest.approx(1 + np.argmin(seconds), abs=1e-4)
     parts = 0.25 * np.mean(c) + 0.25 * np.mean(e) + 0.5 * np.mean(s)
     expected = 100 * parts * 0.7**reds * 0.9 ** (10 * np.mean(speeding)) * 0.6
     assert float(faithful.drive) == pytest.approx(expected, rel=1e-4)

@@ -288,3 +288,16 @@ def test_csv(tmp_path):
     )
     assert read_csv(paths[1]).column("seed").to_pylist() == [6, 7, 5, 4, 3, 2, 1, 0]
     assert read_csv(paths[2]).num_rows == 8
+
+
+def test_notebooks_show_a_table():
+    table = tables.TextTable(["seed", "what"], [["3", "contact"], ["5", ""]], ["first note", "second"])
+    assert table._repr_markdown_().splitlines() == [
+        "| seed | what |",
+        "| --- | ---: |",
+        "| 3 | contact |",
+        "| 5 |  |",
+        "",
+        "first note  ",
+        "second  ",
+    ]

@@ -9,11 +9,16 @@ import numpy as np
 import pytest
 from traffic_worlds import bundled
 
+from limsim_jax.cli.trace import write_trace
+from limsim_jax.maps.lane_map import VEHICLE_CLASSES
 from limsim_jax.maps.routing import default_goals
+from limsim_jax.policies.area import AreaOfInterest
+from limsim_jax.policies.base import LikeTraffic
+from limsim_jax.policies.simple import FollowLane
 from limsim_jax.rollout import Rollout, Worlds, fork, load, save, trace, world_key
-from limsim_jax.traffic.demand import Flow, build_demand, entries, sample_scenario
+from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, entries, sample_scenario
 from limsim_jax.traffic.engine import Traffic
-from limsim_jax.traffic.vehicles import default_population, fitting
+from limsim_jax.traffic.vehicles import default_population, fitting, sample_vehicles, uniform_population
 from limsim_jax.types import Config
 
 SLOTS = 24
@@ -83,6 +88,103 @@ def test_saved_and_resumed_ends_as_run_through(tmp_path):
     other = jax.tree.map(lambda x: jnp.zeros((3, *jnp.shape(x)), jnp.result_type(x)), start)
     with pytest.raises(ValueError, match=r"world\.npz: .* is .*, not"):
         load(tmp_path / "world.npz", other)
+
+
+@functools.cache
+def area():
+    """5 s of a world in which the policy plans for those around the ego, which keeps to its lane."""
+    network, lane_map = bundled("roundabout")
+    typical = uniform_population("car")
+    kind = jnp.argmax(typical.share)[None].astype(jnp.int32)
+    driver, shape = sample_vehicles(typical, jax.random.key(0), jnp.zeros(1, jnp.int32), kind)
+    egos = EgoStart(driver=driver, shape=shape, free=jnp.asarray([False]))
+    population = fitting(default_population({"car": 0.4, "van": 0.3, "motorcycle": 0.3}), lane_map)
+    demand = build_demand(
+        network, lane_map, default_goals(network), [], population, horizon=5.0, density=6.0, egos=egos
+    )
+    policy = AreaOfInterest(FollowLane(), ego=LikeTraffic(), slots=3, radius=70.0)
+    run = Rollout(Config(dt=0.1), Traffic(), horizon=5.0, policy=policy, record=trace)
+
+    def one(key):
+        scenario = sample_scenario(demand, lane_map, key, SLOTS, egos)
+        return scenario.start, run(lane_map, scenario, key)
+
+    return jax.device_get(jax.jit(one)(world_key(4)))
+
+
+def test_a_trace_tells_whom_the_policy_drives_and_what_it_plans():
+    end, _, seen, _ = area()[1]
+    assert seen.driven.shape == (50, 4) and (seen.driven[:, 0] == 0).all()
+    np.testing.assert_array_equal(seen.driven[-1], end.egos.slot)
+    others = seen.driven[:, 1:]
+    assert (others >= 0).any() and (others != 0).all()
+    assert np.isnan(seen.plan[:, 0]).all()  # it keeps to its lane, as the traffic does
+    np.testing.assert_array_equal(np.isnan(seen.plan[:, 1:]).any((-1, -2)), others < 0)
+    rows = [set(row[row >= 0]) for row in others]
+    assert all(len(found) == (row >= 0).sum() for found, row in zip(rows, others, strict=True))
+    # plans begin where the vehicle is, when the decision falls, and stay until the next one
+    every, started = 5, 0
+    for k in range(every, 50):
+        decided = k // every * every
+        assert seen.plan_time[k, 0] == pytest.approx(seen.time[decided - 1], abs=1e-5)
+        np.testing.assert_array_equal(seen.plan[k], seen.plan[decided])
+        for row in np.flatnonzero(seen.driven[k] > 0):
+            here = seen.box[decided - 1, seen.driven[k, row], :2]
+            np.testing.assert_allclose(seen.plan[k, row, 0], here, atol=0.02)
+            started += 1
+    assert started > 20
+    np.testing.assert_allclose(np.diff(seen.plan_time, axis=-1), 0.2, atol=1e-5)
+
+
+def test_a_trace_tells_classes_and_the_way_to_go():
+    lane_map = bundled("roundabout")[1]
+    start, (end, _, seen, _) = area()
+    np.testing.assert_array_equal(seen.vehicle_class[-1], end.shape.vehicle_class)
+    names = {VEHICLE_CLASSES[kind] for kind in seen.vehicle_class[0][seen.active[0]]}
+    assert {"van", "motorcycle"} <= names <= {"car", "van", "motorcycle"}
+    # of the ego to the end of its goal: along the route it gets less as it drives
+    goal = int(start.goal[0])
+    assert seen.active[:, 0].all() and (seen.v[:, 0] > 0.5).any()
+    here = np.asarray(lane_map.routes.distance)[seen.lane[:, 0], goal] - seen.s[:, 0]
+    np.testing.assert_allclose(seen.to_go, here, atol=1e-3)
+    stays = np.diff(seen.lane[:, 0]) == 0  # lanes side by side count with their mean length
+    assert stays.sum() > 40
+    np.testing.assert_allclose(-np.diff(seen.to_go)[stays], 0.1 * seen.v[1:, 0][stays], atol=0.02)
+
+
+def test_tables_of_a_trace_tell_it_too(tmp_path):
+    network, lane_map = bundled("roundabout")
+    seen = area()[1].trace
+    write_trace(tmp_path / "a.npz", network, lane_map, seen)
+    with np.load(tmp_path / "a.npz") as file:
+        arrays = {name: file[name] for name in file.files}
+    for k in (0, 20, 49):
+        assert set(np.flatnonzero(arrays["driven"][k])) == set(seen.driven[k][seen.driven[k] >= 0])
+    assert arrays["vehicle_class_ids"][arrays["vehicle_class"][0, 0]] == "car"
+    np.testing.assert_array_equal(arrays["to_go"][:, 0], seen.to_go)
+    assert np.isnan(arrays["to_go"][:, 1:]).all()
+    np.testing.assert_array_equal(arrays["plan_slot"], seen.driven)
+    x, y = lane_map.origin
+    np.testing.assert_allclose(arrays["plan_x"], seen.plan[..., 0] + float(x), atol=1e-3)
+    np.testing.assert_allclose(arrays["plan_y"], seen.plan[..., 1] + float(y), atol=1e-3)
+
+    parquet = pytest.importorskip("pyarrow.parquet")
+    write_trace(tmp_path / "a.parquet", network, lane_map, seen)
+    rows = parquet.read_table(tmp_path / "a.parquet").to_pydict()
+    on = seen.active
+    assert rows["vehicle_class"] == [VEHICLE_CLASSES[kind] for kind in seen.vehicle_class[on]]
+    assert sum(rows["driven"]) == (seen.driven >= 0).sum() and len(rows["driven"]) == on.sum()
+    known = ~np.isnan(rows["to_go"])
+    np.testing.assert_allclose(np.asarray(rows["to_go"])[known], seen.to_go)
+    assert set(np.asarray(rows["slot"])[known]) == {0}
+
+
+def test_a_trace_of_traffic_alone_knows_of_no_egos():
+    scenario = jax.jit(sampler())(world_key(1))
+    start = RUN.begin(bundled("roundabout")[1], scenario.start)
+    seen = part()(scenario.schedule, jax.random.key(5), start)[0].trace
+    assert seen.driven is seen.to_go is seen.plan is seen.plan_time is None
+    assert seen.vehicle_class.shape == (75, SLOTS)
 
 
 def test_branches_of_a_world_begin_alike():

@@ -23,7 +23,7 @@ from traffic_worlds import bundled
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES, absolute, lane_ids, lane_rows, pose
 from limsim_jax.maps.signals import SignalState
 from limsim_jax.report.video import EGO, SIGNALS
-from limsim_jax.report.viewer import write_viewer
+from limsim_jax.report.viewer import DRIVEN, write_viewer
 from limsim_jax.rollout import Trace
 from limsim_jax.types import Status
 
@@ -165,7 +165,9 @@ LENGTH = np.array([4.0, 5.5, 4.4, 4.8, 12.0, 4.6])
 WIDTH = np.array([1.7, 1.9, 1.8, 1.75, 2.5, 1.8])
 SWAP = 31  # step at which another vehicle has the slot AGAIN, without a step between
 TIME = np.float32(DT) * np.arange(1, T + 1, dtype=np.float32)
-CLASSES = np.array([0, 1, 0, 4, 3, -1])
+CLASSES = np.array([0, 1, 0, 4, 3, 5])
+TAKEN, GIVEN = 10, 40  # steps from and until which TURNS is driven by the policy
+EVERY, AHEAD = 5, 21  # steps per decision, moments of a plan
 
 
 def driven(lane_map: Any, route: list[int], way: Any) -> tuple[Any, Any]:
@@ -214,9 +216,29 @@ def made() -> Any:
     fields: dict[str, Any] = dict(
         time=TIME, active=active, vehicle=vehicle.astype(np.int32), lane=lane, s=s, d=0.125 - 0 * s, v=v, a=a,
         box=np.stack([x, y, heading, *size], -1).astype(np.float32),
-        status=status.astype(np.int32), phase=phase,
+        status=status.astype(np.int32), phase=phase, **planned(x, y, heading, step),
+        vehicle_class=np.broadcast_to(CLASSES, shape), to_go=np.where(step < 55, 312.5 - 1.1 * step, np.nan),
     )  # fmt: skip
     return network, lane_map, Trace(**fields)
+
+
+def planned(x: Any, y: Any, heading: Any, step: Any) -> dict[str, Any]:
+    """SELF is always driven by the policy, TURNS for a while; HIT, too, but there is no plan for it."""
+    turns = np.where((step >= TAKEN) & (step < GIVEN), TURNS, -1)
+    decided = step // EVERY * EVERY
+    tau = DT * np.arange(AHEAD)
+    plan = np.full((T, 3, AHEAD, 2), np.nan, np.float32)
+    for row, (slot, v) in enumerate(((SELF, 12.0), (TURNS, 6.0))):
+        along, left = v * tau, 4.0 * tau**2
+        x0, y0, angle = (np.asarray(z)[decided, slot][:, None] for z in (x, y, heading))
+        plan[:, row, :, 0] = x0 + along * np.cos(angle) - left * np.sin(angle)
+        plan[:, row, :, 1] = y0 + along * np.sin(angle) + left * np.cos(angle)
+    plan[turns < 0, 1] = np.nan
+    return {
+        "driven": np.stack([0 * step + SELF, turns, 0 * step + HIT], -1).astype(np.int32),
+        "plan": plan,
+        "plan_time": (DT * decided[:, None] + tau).astype(np.float32),
+    }
 
 
 MOMENTS = [
@@ -253,11 +275,10 @@ def payload(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 def page(world: Any, tmp_path_factory: Any) -> Path:
     network, lane_map, trace = world
     path = tmp_path_factory.mktemp("viewer") / "replay.html"
-    plans = [(float(TIME[k]), trace.box[k : k + 20 : 4, SELF, :2]) for k in range(0, 40, 5)]
     interest = np.broadcast_to(np.arange(N) != AGAIN, (T, N))
     write_viewer(
-        path, network, lane_map, trace, ego=SELF, moments=MOMENTS, plans=plans, interest=interest,
-        classes=CLASSES, title="a <b>bold</b> title",
+        path, network, lane_map, trace, ego=SELF, moments=MOMENTS, interest=interest,
+        title="a <b>bold</b> title",
     )  # fmt: skip
     return path
 
@@ -356,7 +377,7 @@ def test_a_clock_that_stands_still_ends_the_replay(world, tmp_path):
 
 def test_every_third_step(world, tmp_path):
     network, lane_map, trace = world
-    write_viewer(tmp_path / "a.html", network, lane_map, trace, every=3, classes=np.tile(CLASSES, (T, 1)))
+    write_viewer(tmp_path / "a.html", network, lane_map, trace, every=3)
     meta, columns = payload(tmp_path / "a.html")
     assert meta["steps"] == 20
     np.testing.assert_allclose(columns["s"][SELF], trace.s[::3, SELF], atol=0.006)
@@ -380,6 +401,50 @@ def test_a_minute_of_64_vehicles_is_less_than_a_megabyte(tmp_path):
     assert (tmp_path / "a.html").stat().st_size < 1e6
 
 
+def test_plans_are_kept_once_per_decision_in_quarters_of_a_second(world, page, tmp_path):
+    _, lane_map, trace = world
+    meta, columns = payload(page)
+    assert meta["plan"] == {"points": 9, "per_second": 4}
+    of = columns["plan_of"].astype(int)
+    np.testing.assert_array_equal(columns["driven"].T, trace.driven)
+    np.testing.assert_array_equal(of.T >= 0, np.isfinite(trace.plan).all((-1, -2)))
+    assert columns["plan_x"].shape == (T // EVERY + (GIVEN - TAKEN) // EVERY, 9)
+    for row in (0, 1):
+        for k in np.flatnonzero(of[row] >= 0):
+            for axis, letter in enumerate("xy"):
+                at = np.interp(0.25 * np.arange(9), DT * np.arange(AHEAD), trace.plan[k, row, :, axis])
+                np.testing.assert_allclose(columns[f"plan_{letter}"][of[row, k]], at, atol=0.006)
+    np.testing.assert_allclose(columns["to_go"][0, :55], trace.to_go[:55], atol=0.006)
+    assert (columns["to_go"][0, 55:] == -1).all()
+    # the distance to the goal is that of the first ego: nobody else's
+    write_viewer(tmp_path / "a.html", bundled("intersection")[0], lane_map, trace, ego=LEAD)
+    assert "to_go" not in payload(tmp_path / "a.html")[1]
+
+
+def test_plans_of_a_minute_take_less_than_half_a_megabyte(world, tmp_path):
+    network, lane_map, trace = world
+    repeats, rows = 10, 9
+    rng = np.random.default_rng(1)
+    fields: Any = [np.concatenate([x] * repeats) for x in trace]
+    many = Trace(*fields)._replace(time=np.arange(1, T * repeats + 1) / 10)
+    decisions = np.cumsum(rng.normal(0, 0.3, (T * repeats // EVERY, rows, 50, 2)) + 1.0, 2)
+    plan = np.repeat(decisions, EVERY, 0).astype(np.float32)
+    driven = np.broadcast_to(np.arange(rows) % N, (T * repeats, rows))
+    plan_time = np.repeat(0.5 * np.arange(len(decisions)), EVERY)[:, None] + 0.1 * np.arange(50)
+    bare, full = tmp_path / "bare.html", tmp_path / "full.html"
+    write_viewer(bare, network, lane_map, many._replace(plan=None, plan_time=None))
+    write_viewer(full, network, lane_map, many._replace(plan=plan, driven=driven, plan_time=plan_time))
+    assert 1e4 < full.stat().st_size - bare.stat().st_size < 5e5
+
+
+def test_a_trace_without_egos_is_shown_without_theirs(world, tmp_path):
+    network, lane_map, trace = world
+    names = ("vehicle_class", "driven", "to_go", "plan", "plan_time")
+    write_viewer(tmp_path / "a.html", network, lane_map, trace._replace(**dict.fromkeys(names)), ego=SELF)
+    meta, columns = payload(tmp_path / "a.html")
+    assert meta["plan"] is None and not {"class", "driven", "to_go", "plan_of"} & set(columns)
+
+
 def test_the_file_needs_nothing_else(page):
     text = re.sub(r'id="data">[^<]*<', "", page.read_text())
     assert not re.search(
@@ -400,12 +465,10 @@ def test_the_file_needs_nothing_else(page):
         (dict(moments=[{"kind": "contact", "time": float("nan")}]), "moment 0 has no time"),
         (dict(moments=[{"kind": "contact", "time": 60.0}]), "(contact) is at 60 s; the trace goes to 6 s"),
         (dict(moments=[{"kind": "contact", "time": 1.0, "other": 9}]), "other vehicle 9? the trace has"),
-        (dict(plans=[(1.0, np.zeros((4, 3)))]), "plan 0 of shape (4, 3)"),
-        (dict(plans=[(1.0, np.zeros((4, 2))), (0.5, np.zeros((4, 2)))]), "plan 1 is at 0.5 s"),
+        (dict(interest=[(1.0, np.zeros((4, 3)))]), "polygon of interest 0 of shape (4, 3)"),
+        (dict(interest=[(1.0, np.eye(4, 2)), (0.5, np.eye(4, 2))]), "polygon of interest 1 is at 0.5 s"),
         (dict(interest=[(1.0, np.full((4, 2), np.nan))]), "not finite"),
         (dict(interest=np.ones((T, N + 1))), "interest of shape"),
-        (dict(classes=np.zeros(N + 2, int)), "classes of shape"),
-        (dict(classes=np.full(N, len(VEHICLE_CLASSES))), "classes from 6 to 6; they are -1 to 5"),
     ],
 )  # fmt: skip
 def test_bad_input_is_refused_in_one_line(world, tmp_path, change, message):
@@ -427,6 +490,17 @@ def test_a_trace_that_does_not_fit_is_refused(world, tmp_path):
         write_viewer(path, network, lane_map, trace._replace(phase=trace.phase[:, :-1]))
     with pytest.raises(ValueError, match="on lane 5000; the map has lanes 0 to"):
         write_viewer(path, network, lane_map, trace._replace(lane=trace.lane % 1 + 5000))
+    with pytest.raises(ValueError, match="classes from 6 to 10; they are 0 to 5"):
+        write_viewer(path, network, lane_map, trace._replace(vehicle_class=trace.vehicle_class + 6))
+    with pytest.raises(ValueError, match="driven: slots beyond those of the trace, 0 to 5"):
+        write_viewer(path, network, lane_map, trace._replace(driven=trace.driven + 4))
+    with pytest.raises(ValueError, match=r"plan of shape \(60, 2, 21, 2\) instead of \(60, 3, 21, 2\)"):
+        write_viewer(path, network, lane_map, trace._replace(plan=trace.plan[:, 1:]))
+    with pytest.raises(ValueError, match=r"plan of shape \(60, 3, 21, 2\) instead of \(60, 3, 20, 2\)"):
+        write_viewer(path, network, lane_map, trace._replace(plan_time=trace.plan_time[:, 1:]))
+    with pytest.raises(ValueError, match="plan of 1 moments"):
+        short = trace._replace(plan=trace.plan[:, :, :1], plan_time=trace.plan_time[:, :1])
+        write_viewer(path, network, lane_map, short)
     with pytest.raises(ValueError, match=r"use \.html"):
         write_viewer(tmp_path / "a.txt", network, lane_map, trace)
 
@@ -696,6 +770,93 @@ def test_colours_tell_the_ego_lights_and_brakes(world, page, browser):
         return color[0] > 200 and color[1] < 90 and color[2] < 90
 
     assert not red(rear(10, SELF)) and red(rear(50, SELF)) and red(rear(5, HIT))  # at a = -0.85, -1.25, -3
+
+
+def near(color: tuple[int, ...], other: str) -> bool:
+    return max(abs(a - b) for a, b in zip(color, rgb(other), strict=True)) < 60
+
+
+def test_plans_are_drawn_where_they_lead_until_the_next_decision(world, page, browser):
+    _, lane_map, trace = world
+    at = np.stack(absolute(lane_map, trace.plan[..., 0], trace.plan[..., 1]), -1)  # [T, 3, H, 2]
+    after = {0: 15, 1: 20}  # 0.1 s: dots at 2 s, and the line between the dots
+
+    def seen(k: int, row: int, of: int) -> tuple[int, ...]:
+        """The colour at step k of where the plan of step `of` leads."""
+        x, y = at[of, row, after[row]]
+        browser.open(page, f"#t={TIME[k]:.1f}&select={HIT}&follow=0&view={x},{y},12")
+        browser.run(hide)
+        browser.state()
+        middle = browser.run("(c => [c.width / 2, c.height / 2])(document.getElementById('view'))")
+        return pixel(browser, *middle)
+
+    for row, color, k in ((0, EGO, 22), (1, DRIVEN, 12)):
+        hide = ""
+        assert near(seen(k, row, k), color) and near(seen(k + 2, row, k), color), row
+        assert not near(seen(k + 3, row, k), color) and near(seen(k + 3, row, k + 3), color), row
+        hide = "document.querySelector('[data-layer=plan]').click()"
+        assert not near(seen(k, row, k), color), row
+        assert problems(browser) == []
+    hide = ""
+    assert not near(seen(GIVEN, 1, GIVEN - 1), DRIVEN)
+    for i, wide in ((20, True), (15, False)):  # dots at whole seconds
+        (x, y), along = at[22, 0, i], at[22, 0, i] - at[22, 0, i - 1]
+        heading = float(np.arctan2(along[1], along[0]))
+        browser.open(page, f"#t={TIME[22]:.1f}&select={HIT}&follow=0&view={x},{y},12")
+        width, height = browser.run("(c => [c.width / 2, c.height / 2])(document.getElementById('view'))")
+        beside = (width + 2.4 * np.sin(heading), height + 2.4 * np.cos(heading))
+        assert near(pixel(browser, *beside), EGO) == wide
+
+
+def test_whom_the_policy_drives_is_outlined(world, page, browser):
+    _, lane_map, trace = world
+
+    def outline(k: int, slot: int) -> tuple[int, ...]:
+        scale = 10
+        x, y = (float(z) for z in absolute(lane_map, *trace.box[k, slot, :2]))
+        browser.open(page, f"#t={TIME[k]:.1f}&select={AGAIN}&follow=0&view={x},{y},{scale}")
+        browser.run("document.querySelector('[data-layer=plan]').click()")
+        state = browser.state()
+        heading = trace.box[k, slot, 2]
+        left = np.array([-np.sin(heading), -np.cos(heading)])
+        return pixel(browser, *(np.array(centre(state, slot)) + (0.5 * WIDTH[slot] * scale + 2) * left))
+
+    assert near(outline(TAKEN, TURNS), DRIVEN) and near(outline(GIVEN - 1, TURNS), DRIVEN)
+    assert not near(outline(TAKEN - 1, TURNS), DRIVEN) and not near(outline(GIVEN, TURNS), DRIVEN)
+    assert not near(outline(TAKEN, LEAD), DRIVEN) and not near(outline(TAKEN, SELF), DRIVEN)
+    assert near(outline(2, HIT), DRIVEN)  # by a policy without trajectories
+    assert browser.run("document.getElementById('outlined').checkVisibility()")
+    for slot, driver in ((SELF, "the policy"), (LEAD, "the traffic model"), (TURNS, "the policy")):
+        browser.open(page, f"#t={TIME[TAKEN]:.1f}&select={slot}")
+        assert browser.text("[data-field=driver]") == driver
+
+
+def test_the_distance_of_the_ego_to_its_goal(world, page, browser):
+    _, _, trace = world
+    for k in (0, 33):
+        browser.open(page, f"#t={TIME[k]:.1f}&select={SELF}")
+        assert browser.fact("to_go") == pytest.approx(trace.to_go[k], abs=0.006)
+        assert browser.text("#at_to_go") == f"{trace.to_go[k]:.1f}"
+    browser.open(page, f"#t={TIME[57]:.1f}&select={SELF}")
+    assert np.isnan(browser.fact("to_go")) and browser.text("#at_to_go") == ""
+    left, top, width, height = browser.run(
+        "(b => [b.x + 30, b.y, b.width - 36, b.height])(plot_to_go.getBoundingClientRect())"
+    )
+    state = browser.click(left + 0.5 * width, top + 0.5 * height)
+    first, last = float(TIME[0]), float(TIME[-1])
+    assert float(state["time"]) == pytest.approx(first + 0.5 * (last - first), abs=0.02)
+    # the line falls from left to right; axes: 0 at 3 px above the bottom, 1.06 times the most at the top
+    k = 20
+    x = 30 + (TIME[k] - TIME[0]) / (TIME[-1] - TIME[0]) * width
+    y = (height - 3) - trace.to_go[k] / (1.06 * trace.to_go[0]) * (height - 3 - 4)
+    script = f"[...plot_to_go.getContext('2d').getImageData({x:.0f}, {y:.0f} - 1, 1, 3).data]"
+    colors = np.reshape(browser.run(script), (3, 4))[:, :3]
+    accent = (11, 98, 168)
+    assert np.abs(colors - accent).max(-1).min() < 80
+    browser.open(page, f"#t={TIME[3]:.1f}&select={LEAD}")
+    visible = "document.querySelector('{}').checkVisibility()"
+    assert not browser.run(visible.format("[data-field=to_go]")) and not browser.run(visible.format("#goal"))
+    assert problems(browser) == []
 
 
 def test_names_from_files_stay_text(world, tmp_path, browser):

@@ -13,7 +13,7 @@ defects, and around lane changes. What is cut and why stands in the `Quality` of
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,7 @@ class Segment:
     gap: Floats  # m, bumper to bumper
     v: Floats  # m/s
     v_lead: Floats  # m/s
+    length_lead: float = 4.5  # m
 
     def __len__(self) -> int:
         return len(self.gap)
@@ -66,10 +67,7 @@ class Segment:
     def part(self, begin: int, end: int) -> Segment:
         """Samples `begin` to `end`."""
         values = {name: getattr(self, name)[begin:end] for name in ("gap", "v", "v_lead")}
-        same = {name: getattr(self, name) for name in ("driver", "leader", "source", "line", "dt")}
-        return Segment(
-            **same, **values, time=self.time + begin * self.dt, vehicle_class=self.vehicle_class
-        )  # fmt: skip
+        return replace(self, **values, time=self.time + begin * self.dt)
 
 
 @dataclass(kw_only=True)
@@ -102,6 +100,7 @@ def segments(
     dt: float = 0.1,
     shortest: float = SHORTEST,
     smoothing: float = SMOOTHING,
+    margins: bool = True,
 ) -> tuple[list[Segment], Quality]:
     """Car-following segments of a recording, and how good it is.
 
@@ -110,6 +109,7 @@ def segments(
       dt: s, time step of the result; recordings in coarser or finer steps are interpolated.
       shortest: s, shorter segments are dropped.
       smoothing: s, window of the smoothing of positions; 0: none.
+      margins: drop what is next to changes of the leader or the lane.
 
     Raises:
       RecordingError: nothing is left.
@@ -126,7 +126,7 @@ def segments(
         recorded=float(following.sum() * r.dt),
         findings=[defect.message for defect in r.defects],
     )
-    bad = _bad(r, quality)
+    bad = _bad(r, quality, margins)
     found: list[Segment] = []
     errors: list[tuple[Floats, Floats]] = []
     starts, ends = _stretches(r, bad)
@@ -177,7 +177,7 @@ def _name(r: Recording, row: int) -> str:
     return r.names[r.vehicle[row]]
 
 
-def _bad(r: Recording, quality: Quality) -> NDArray[np.bool_]:
+def _bad(r: Recording, quality: Quality, margins: bool) -> NDArray[np.bool_]:
     """Rows that are not used, with the reasons counted."""
     none = r.leader < 0
     overlap = ~none & ~(r.gap > 0)
@@ -188,6 +188,8 @@ def _bad(r: Recording, quality: Quality) -> NDArray[np.bool_]:
     leader = np.diff(r.leader, prepend=r.leader[:1]) != 0
     changes["a change of the leader"] = (LEADER_CHANGE, leader & ~new)
     bad = none | overlap
+    if not margins:
+        changes.clear()
     # With the defects of a pair goes what is next to them.
     changes["a defect"] = (LEADER_CHANGE, overlap)
     for reason, (margin, at) in changes.items():
@@ -257,6 +259,7 @@ def _segment(
             gap=gap,
             v=v,
             v_lead=v_lead,
+            length_lead=float(np.median(r.length_lead[rows])),
         ),
         speeds,
         moved,

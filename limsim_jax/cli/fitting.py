@@ -39,6 +39,15 @@ def calibrate(
     speed_limit: Annotated[
         float | None, typer.Option(help="Of the recorded road, m/s; relates desired speeds to limits.")
     ] = None,
+    closed_loop: Annotated[
+        bool,
+        typer.Option(
+            "--closed-loop",
+            help="Then adjust the population until followers simulated behind one another are distributed "
+            "as recorded.",
+        ),
+    ] = False,
+    period: Annotated[float, typer.Option(help="Closed loop: s of recording simulated at a time.")] = 60.0,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON.")
     ] = None,
@@ -46,19 +55,39 @@ def calibrate(
     """Fit car following to recorded drivers: errors, uncertainty and the population they come from."""
     import json
 
+    from limsim_jax.calibration.closed_loop import (
+        SPEED_LIMIT,
+        calibrate_closed_loop,
+        hold_out,
+        linked_recordings,
+    )
     from limsim_jax.calibration.report import calibrate as fit
     from limsim_jax.files import write_whole
     from limsim_jax.rollout import enable_compilation_cache
 
     _check_folders(out, json_file)
+    if not 10 <= period < float("inf"):
+        raise typer.BadParameter(f"{period:g} s; at least 10", param_hint="--period")
     enable_compilation_cache()
+    linked = linked_recordings(data, period=period) if closed_loop else None
+    if linked is not None:
+        hold_out(linked)  # refuses what has one period only, before anything is fitted
     found = fit(data, model=model, objective=objective, method=method, shortest=shortest, seed=seed)
     print(found.text())
+    result, content = found, found.as_json()
+    if linked is not None:
+        if found.law is None:
+            raise ValueError(f"a population from {len(found.fit.drivers)} drivers; at least 3 are needed")
+        result = calibrate_closed_loop(
+            linked, found.law, model=model, speed_limit=speed_limit or SPEED_LIMIT, seed=seed
+        )
+        print(f"\n{result.text()}")
+        content["closed_loop"] = result.as_json()
     if out is not None:
-        found.write_population(out, speed_limit=speed_limit)
+        result.write_population(out, speed_limit=speed_limit)
         print(f"wrote {out}")
     if json_file is not None:
-        write_whole(json_file, (json.dumps(found.as_json(), indent=1) + "\n").encode())
+        write_whole(json_file, (json.dumps(content, indent=1) + "\n").encode())
 
 
 def train(

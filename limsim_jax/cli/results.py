@@ -245,11 +245,11 @@ def replay(
         case ".gif" | ".mp4":
             from limsim_jax.report.video import write_video
 
-            write_video(path, network, lane_map, trace)
+            write_video(path, network, lane_map, trace, egos=[ego])
         case ".png":
             from limsim_jax.report.video import write_picture
 
-            write_picture(path, network, lane_map, trace)
+            write_picture(path, network, lane_map, trace, egos=[ego])
         case _:
             from limsim_jax.cli.trace import write_trace
 

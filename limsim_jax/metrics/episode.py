@@ -135,6 +135,8 @@ NAMES = {
     "limsim_corrected_comfort": "0 to 1",
     "limsim_corrected_efficiency": "0 to 1",
     "limsim_corrected_safety": "0 to 1",
+    "worst_second": "0 to 100, LimSim's score of the worst second, as corrected, without its factors",
+    "worst_second_time": "s, when it ended",
 }
 """What `EgoMetrics.result` measures."""
 
@@ -301,7 +303,9 @@ class EgoMetrics:
         ttc = first_touch(begin, cease)
         touched = carry.contact.touched
         apart = there & ~touched
-        ttc_2d = jnp.min(jnp.where(apart & step.relevant, ttc, NONE))
+        # who touches, or is near an ego that leaves its lane, counts whatever way both meant to go
+        meets = step.relevant | step.changing[step.slot] | ((begin <= 0) & (cease >= 0))
+        ttc_2d = jnp.min(jnp.where(apart & meets, ttc, NONE))
         has_lead = (step.lead >= 0) & step.active[step.lead]
         gap = jnp.where(has_lead, step.lead_gap, NO_GAP)
         v_lead = jnp.where(has_lead, speed[step.lead], 0)
@@ -365,6 +369,7 @@ class EgoMetrics:
             dt,
             carry.limsim,
             filtered,
+            t=t,
             a=step.a,
             lateral=motion.lateral,
             v=step.v,
@@ -528,4 +533,6 @@ class EgoMetrics:
         for version, score in limsim.items():
             for name in ("total", "drive", "comfort", "efficiency", "safety"):
                 results[f"limsim_{version}_{name}"] = measured(getattr(score, name), score.valid)
+        results["worst_second"] = carry.limsim.worst.result()
+        results["worst_second_time"] = carry.limsim.worst.when()
         return results

@@ -43,7 +43,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.metrics.motion import Filtered
-from limsim_jax.metrics.reductions import Mean
+from limsim_jax.metrics.reductions import Least, Mean
 from limsim_jax.metrics.safety import NONE
 from limsim_jax.numerics import masked_sum, safe_divide
 
@@ -288,6 +288,7 @@ class LimSimCarry(NamedTuple):
     begin: Float[Array, " 2"]  # m/s^2, along and across, at the end of the second before
     second: LimSimSecond
     # over seconds
+    worst: Least  # score of a second, 0 to 100
     comfort: Mean
     efficiency: Mean
     corrected_efficiency: Mean
@@ -313,6 +314,7 @@ def limsim_init() -> LimSimCarry:
         started=jnp.zeros((), bool),
         begin=jnp.zeros(2),
         second=_no_second(),
+        worst=Least.empty(),
         comfort=Mean.empty(),
         efficiency=Mean.empty(),
         corrected_efficiency=Mean.empty(),
@@ -330,6 +332,7 @@ def limsim_update(
     carry: LimSimCarry,
     filtered: Filtered,
     *,
+    t: Float[Array, ""],
     a: Float[Array, ""],
     lateral: Float[Array, ""],
     v: Float[Array, ""],
@@ -343,9 +346,9 @@ def limsim_update(
 ) -> LimSimCarry:
     """One step; the first call sets the start. A second that is not full at the end does not count.
 
-    `a`, `lateral`: m/s^2 along and across, unfiltered. `v_others`: mean speed of the cars on the same
-    road or on the next lane, if there are `others`; `limit`: m/s; `ttc`: s, least; `red_light`: crosses a
-    stop line on red in this step; `waits_at_red`: stands within 15 m of one.
+    `t`: s, now. `a`, `lateral`: m/s^2 along and across, unfiltered. `v_others`: mean speed of the cars on
+    the same road or on the next lane, if there are `others`; `limit`: m/s; `ttc`: s, least; `red_light`:
+    crosses a stop line on red in this step; `waits_at_red`: stands within 15 m of one.
     """
     counts = carry.started
     old = carry.second
@@ -373,13 +376,16 @@ def limsim_update(
     corrected = jnp.where(second.waits, 1, efficiency)
     safety = jnp.minimum(second.ttc / LIMSIM_TTC, 1)
     over = second.fastest > limit
+    mean_comfort = jnp.mean(jnp.stack(comfort))
+    score = 100 * (0.25 * mean_comfort + 0.25 * corrected + 0.5 * safety)
 
     carry = _add_samples(carry, filtered)
     return carry._replace(
         started=jnp.ones((), bool),
         begin=jnp.where(full, now, begin),
         second=_where(full, _no_second(), second),
-        comfort=carry.comfort.add(jnp.mean(jnp.stack(comfort)), full),
+        worst=carry.worst.add(score, t, full),
+        comfort=carry.comfort.add(mean_comfort, full),
         efficiency=carry.efficiency.add(efficiency, full),
         corrected_efficiency=carry.corrected_efficiency.add(corrected, full),
         safety=carry.safety.add(safety, full),

@@ -90,6 +90,7 @@ _VALUES = {
     "contact": "delta-v {:.1f} m/s",
     "near_miss": "TTC {:.2f} s",
     "hard_brake": "{:.1f} m/s²",
+    "score_drop": "{:.0f} of 100",
 }
 _BLAME = {
     "ego": "the ego",

@@ -336,11 +336,16 @@ def _resampled(x: Floats, there: NDArray[np.bool_], resamples: int, seed: int) -
 
 
 class TextTable(NamedTuple):
-    """A table to print."""
+    """A table to print; notebooks show it as one."""
 
     header: list[str]
     rows: list[list[str]]
     notes: list[str]
+
+    def _repr_markdown_(self) -> str:
+        marks = ["---", *["---:"] * (len(self.header) - 1)]
+        lines = [" | ".join(cells).join(("| ", " |")) for cells in (self.header, marks, *self.rows)]
+        return "\n".join([*lines, "", *(f"{note}  " for note in self.notes)])
 
 
 def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = None) -> TextTable:

@@ -43,6 +43,9 @@ LONGEST_TTC = 60.0
 
 SUFFIXES = (".html", ".htm")
 
+DRIVEN = "#ff7a00"
+"""Colour of vehicles around the ego that the policy drives, and of their plans."""
+
 # A kind of moment in words, and how its value reads: not at all where it would need an explanation.
 _MOMENTS = {
     "contact": ("contact", "delta-v {:.2f} m/s"),
@@ -70,6 +73,7 @@ _STATUS = {
 }
 _THIN = 0.03  # m, a drawn border may deviate from its lane's by this
 _AHEAD_LANES = 5  # lanes on which a leader is looked for
+_PLAN_POINTS = 4  # of a plan per second: a chord of a bend is 0.1 m off at most at 10 m/s and r = 10 m
 _PAIRS = 2**18  # pairs of vehicles measured at once
 
 
@@ -81,9 +85,7 @@ def write_viewer(
     *,
     ego: int | None = None,
     moments: Iterable[Mapping[str, Any]] = (),
-    plans: Sequence[tuple[float, ArrayLike]] | None = None,
     interest: ArrayLike | Sequence[tuple[float, ArrayLike]] | None = None,
-    classes: ArrayLike | None = None,
     title: str = "",
     every: int = 1,
 ) -> None:
@@ -98,14 +100,13 @@ def write_viewer(
       network: the map.
       lane_map: of that map.
       trace: `[T, ...]`, `N` slots. What follows a step at which its clock stands still is left out.
-      ego: slot whose first vehicle is highlighted, and selected and followed at first.
+      ego: slot whose first vehicle is highlighted, and selected and followed at first. Its distance to the
+        goal is shown if the trace has it. Other vehicles that the policy drives are outlined, and the plan
+        of each is shown, in points 1 / 4 s apart, until its next decision.
       moments: what to mark on the time line: rows with `kind` and `time` (s) and, where known, `value`,
         `other` (slot), `responsible`, `module`, `rank` (1: the worst).
-      plans: times (s) of decisions, ascending, and the trajectories planned then: `[P, 2]`, x and y (m) in
-        the coordinates of the lane map. Each is shown until the next one.
-      interest: the area of interest: `[T, N]`, whether a vehicle is in it; or times (s) and polygons
-        `[K, 2]` as for `plans`.
-      classes: `[N]` or `[T, N]` rows of `VEHICLE_CLASSES`, -1 for unknown.
+      interest: the area of interest: `[T, N]`, whether a vehicle is in it; or times (s), ascending, and
+        polygons `[K, 2]`, x and y (m) in the coordinates of the lane map, each shown until the next one.
       title: at the top; the name of the map by default.
       every: keep one of so many steps.
 
@@ -124,7 +125,6 @@ def write_viewer(
     if ego is not None:
         _check_slot(ego, slots, "ego")
     inside, polygons = _check_interest(interest, steps, slots)
-    kinds = _check_classes(classes, steps, slots)
     chosen = np.arange(0, kept, every)
     shown: Any = jax.tree.map(lambda x: np.asarray(x)[chosen], jax.device_get(trace))
     time = shown.time.astype(float)
@@ -138,17 +138,20 @@ def write_viewer(
         "slots": slots,
         "steps": len(chosen),
         "moments": sorted(rows, key=lambda row: row["time"]),
-        "plans": _polylines(pack, "plan", lane_map, plans, 2, "plan"),
-        "interest": _polylines(pack, "interest", lane_map, polygons, 3, "polygon of interest"),
+        "interest": _polygons(pack, lane_map, polygons),
         "classes": VEHICLE_CLASSES,
         "status": {int(bit): text for bit, text in _STATUS.items()},
-        "colors": {"ego": EGO, "collided": COLLIDED, "signals": [SIGNALS[state] for state in SignalState]},
+        "colors": {
+            "ego": EGO,
+            "driven": DRIVEN,
+            "collided": COLLIDED,
+            "signals": [SIGNALS[state] for state in SignalState],
+        },
     }
     _add_traffic(pack, lane_map, shown)
     if inside is not None:
         pack.add("inside", _held(inside[chosen], shown.active).T, 1)
-    if kinds is not None:
-        pack.add("class", _held(kinds[chosen], shown.active).T, 1)
+    meta["plan"] = _add_driven(pack, lane_map, shown, ego)
     meta["network"] = _add_map(pack, network, lane_map, shown.phase)
     _write(path, meta, pack)
 
@@ -172,8 +175,14 @@ def _check_trace(network: Network, lane_map: LaneMap, trace: Trace) -> int:
         raise ValueError("the trace is empty" if time.ndim else "the trace has no axis of time")
     steps, slots = len(time), np.shape(trace.active)[-1]
     lanes, programs = len(lane_ids(network)), lane_map.signals.duration.shape[0]
+    rows = 0 if trace.driven is None else np.shape(trace.driven)[-1]
+    moments = 0 if trace.plan_time is None else np.shape(trace.plan_time)[-1]
+    wanted = {"time": (steps,), "phase": (steps, programs), "box": (steps, slots, 5),
+              "driven": (steps, rows), "to_go": (steps,), "plan": (steps, rows, moments, 2),
+              "plan_time": (steps, moments)}  # fmt: skip
     for name, x in trace._asdict().items():
-        wanted = {"time": (steps,), "phase": (steps, programs), "box": (steps, slots, 5)}
+        if x is None:
+            continue
         shape = wanted.get(name, (steps, slots))
         if np.shape(x) != shape:
             reason = "another map" if name == "phase" and np.shape(x)[:1] == (steps,) else "another trace"
@@ -181,6 +190,17 @@ def _check_trace(network: Network, lane_map: LaneMap, trace: Trace) -> int:
     on = np.asarray(trace.lane)[np.asarray(trace.active)]
     if on.size and on.max() >= lanes:
         raise ValueError(f"a vehicle is on lane {on.max()}; the map has lanes 0 to {lanes - 1}: another map?")
+    if trace.vehicle_class is not None:
+        classes = np.asarray(trace.vehicle_class)[np.asarray(trace.active)]
+        if classes.size and not 0 <= classes.min() <= classes.max() < len(VEHICLE_CLASSES):
+            raise ValueError(
+                f"classes from {classes.min()} to {classes.max()}; they are 0 to {len(VEHICLE_CLASSES) - 1}"
+            )
+    driven = np.zeros(0) if trace.driven is None else np.asarray(trace.driven)
+    if driven.size and not -1 <= driven.min() <= driven.max() < slots:
+        raise ValueError(f"driven: slots beyond those of the trace, 0 to {slots - 1}")
+    if trace.plan is not None and moments < 2:
+        raise ValueError(f"plan of {moments} moments; it takes 2 or more")
     if not np.isfinite(time).all():
         raise ValueError("the trace has times that are not finite")
     stands = np.flatnonzero(np.diff(time) <= 0)
@@ -199,19 +219,6 @@ def _check_interest(interest: Any, steps: int, slots: int) -> tuple[NDArray[np.i
     if interest.shape != (steps, slots):
         raise ValueError(f"interest of shape {interest.shape}; the trace has {(steps, slots)}")
     return np.asarray(interest).astype(bool).astype(np.int64), None
-
-
-def _check_classes(classes: ArrayLike | None, steps: int, slots: int) -> NDArray[np.int64] | None:
-    if classes is None:
-        return None
-    rows = np.asarray(classes)
-    if rows.shape not in ((slots,), (steps, slots)):
-        raise ValueError(f"classes of shape {rows.shape}; the trace has {(steps, slots)}")
-    if rows.min() < -1 or rows.max() >= len(VEHICLE_CLASSES):
-        raise ValueError(
-            f"classes from {rows.min()} to {rows.max()}; they are -1 to {len(VEHICLE_CLASSES) - 1}"
-        )
-    return np.broadcast_to(rows, (steps, slots)).astype(np.int64)
 
 
 def _moment(row: Mapping[str, Any], i: int, time: NDArray[np.float64], slots: int) -> dict[str, Any]:
@@ -246,23 +253,23 @@ def _moment(row: Mapping[str, Any], i: int, time: NDArray[np.float64], slots: in
     }
 
 
-def _polylines(pack: _Pack, name: str, lane_map: LaneMap, lines: Any, least: int, noun: str) -> Any:
-    """Add lines that begin to be shown at their times; returns times and numbers of points."""
-    if lines is None:
+def _polygons(pack: _Pack, lane_map: LaneMap, polygons: Any) -> Any:
+    """Add polygons that begin to be shown at their times; returns times and numbers of points."""
+    if polygons is None:
         return None
     times, counts, points = [], [], [np.zeros((0, 2))]
-    for i, (at, line) in enumerate(lines):
-        line = np.asarray(line, float)
-        if line.ndim != 2 or line.shape[1] != 2 or len(line) < least:
-            raise ValueError(f"{noun} {i} of shape {line.shape}; it takes {least} or more points x, y")
+    for i, (at, line) in enumerate(polygons):
+        line, name = np.asarray(line, float), f"polygon of interest {i}"
+        if line.ndim != 2 or line.shape[1] != 2 or len(line) < 3:
+            raise ValueError(f"{name} of shape {line.shape}; it takes 3 or more points x, y")
         if not (math.isfinite(at) and np.isfinite(line).all()):
-            raise ValueError(f"{noun} {i} has numbers that are not finite")
+            raise ValueError(f"{name} has numbers that are not finite")
         if times and at < times[-1]:
-            raise ValueError(f"{noun} {i} is at {at:g} s, before the one at {times[-1]:g} s")
+            raise ValueError(f"{name} is at {at:g} s, before the one at {times[-1]:g} s")
         times.append(float(at))
         counts.append(len(line))
         points.append(np.stack(absolute(lane_map, line[:, 0], line[:, 1]), -1))
-    pack.add_points(name, np.concatenate(points), _shift(lane_map))
+    pack.add_points("interest", np.concatenate(points), _shift(lane_map))
     return {"time": times, "count": counts}
 
 
@@ -328,6 +335,46 @@ def _add_traffic(pack: _Pack, lane_map: LaneMap, trace: Any) -> None:
     for name, (values, scale) in columns.items():
         known = finite & np.isfinite(values)
         pack.add(name, _held(values, known).T, scale)
+
+
+def _add_driven(pack: _Pack, lane_map: LaneMap, trace: Any, ego: int | None) -> Any:
+    """Add vehicle classes, whom the policy drives, what it plans and how far the ego has to go.
+
+    Returns the rows and points of plans, and the points per second. A plan is stored when it is made.
+    """
+    if trace.vehicle_class is not None:
+        pack.add("class", _held(trace.vehicle_class, trace.active).T, 1)
+    if trace.driven is None or not trace.driven.shape[1]:
+        return None
+    pack.add("driven", trace.driven.T, 1)
+    if trace.to_go is not None and ego is not None and trace.driven[0, 0] == ego:
+        known = np.isfinite(trace.to_go)
+        pack.add("to_go", np.where(known, trace.to_go, -1)[None], 100)
+    if trace.plan is None:
+        return None
+    plan, time = trace.plan.astype(float), trace.plan_time.astype(float)  # [T, E, H, 2], [T, H]
+    there = np.isfinite(plan).all((-1, -2)) & (trace.driven >= 0)
+    if not there.any():
+        return None
+    new = there.copy()
+    same = (plan[1:] == plan[:-1]).all((-1, -2)) & (trace.driven[1:] == trace.driven[:-1])
+    new[1:] &= ~(same & (time[1:, :1] == time[:-1, :1]))
+    number = np.cumsum(new).reshape(new.shape) - 1  # of those made until then, by any row
+    step = np.maximum.accumulate(np.where(new, np.arange(len(new))[:, None], -1))
+    number = np.where(there, np.take_along_axis(number, np.maximum(step, 0), 0), -1)
+    pack.add("plan_of", number.T, 1)
+
+    between = (time[0, -1] - time[0, 0]) / (plan.shape[2] - 1)  # s
+    count = max(2, math.floor((plan.shape[2] - 1) * between * _PLAN_POINTS + 1e-3) + 1)
+    at = np.minimum(np.arange(count) / (_PLAN_POINTS * between), plan.shape[2] - 1)
+    k = np.minimum(at.astype(int), plan.shape[2] - 2)
+    made = plan[new]
+    xy = made[:, k] + (at - k)[:, None] * (made[:, k + 1] - made[:, k])
+    for axis, letter in enumerate("xy"):
+        pack.add(
+            f"plan_{letter}", absolute(lane_map, xy[..., 0], xy[..., 1])[axis] - _shift(lane_map)[axis], 100
+        )
+    return {"points": count, "per_second": _PLAN_POINTS}
 
 
 def _shown(ttc: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -67,7 +67,10 @@ UNSAFE = 4.0
 LEAD_UP = 1.0
 """s around a contact within which near misses and hard braking belong to it."""
 
-MOMENTS = ("contact", "off_road", "red_light", "near_miss", "hard_brake", "unsafe")
+SCORE_DROP = 50.0
+"""LimSim's score of a second below which it is a key moment."""
+
+MOMENTS = ("contact", "off_road", "red_light", "near_miss", "hard_brake", "unsafe", "score_drop")
 """Kinds of key moments, the worst first."""
 
 _MODELS = {"idm": car_following.IDM, "iidm": car_following.IIDM, "acc": car_following.ACC}
@@ -106,7 +109,7 @@ UNITS: dict[str, str] = (
 
 
 class Episodes:
-    """Runs an experiment, chunk by chunk.
+    """Runs an experiment, chunk by chunk; `rollout`, `lane_map` and `sample` are what it is made of.
 
     Args:
       experiment: what to run.
@@ -137,10 +140,10 @@ class Episodes:
             lane_changes=traffic.lane_changes,
             after_collision=traffic.after_collision,
         )
-        self._run = Rollout(config, behaviour, experiment.horizon, self._policy, measure=EvaluateEgo())
+        self.rollout = Rollout(config, behaviour, experiment.horizon, self._policy, measure=EvaluateEgo())
         self.world_bytes = self._memory()
         self.chunk = self._chunk() if chunk is None else chunk
-        self._worlds = Worlds(self._run, self.lane_map, self._sample, chunk=self.chunk)
+        self._worlds = Worlds(self.rollout, self.lane_map, self.sample, chunk=self.chunk)
         self.chunk = self._worlds.chunk
 
     def _refuse(self, field: str, message: str) -> None:
@@ -151,12 +154,13 @@ class Episodes:
         if unknown:
             self._refuse(f"success.{unknown[0]}", f"no such metric; known are {', '.join(self.units)}")
 
-    def _sample(self, key: jax.Array) -> Scenario:
+    def sample(self, key: jax.Array) -> Scenario:
+        """The scenario of a world."""
         return sample_scenario(self._demand, self.lane_map, key, self.experiment.slots, self._egos)
 
     def _memory(self) -> int:
         """Bytes that one more world needs: its arrays at the start, and temporaries in proportion."""
-        scenario = jax.eval_shape(self._sample, jax.random.key(0))
+        scenario = jax.eval_shape(self.sample, jax.random.key(0))
         return _TEMPORARIES * sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(scenario))
 
     def _chunk(self) -> int:
@@ -258,8 +262,8 @@ class Episodes:
     @cached_property
     def _one(self) -> Callable[..., Result]:
         def one(lane_map: LaneMap, seed: jax.Array, slot: jax.Array, at: jax.Array) -> Result:
-            run = replace(self._run, record=trace, policy=_Braking(self._policy, slot, at))
-            return one_world(run, lane_map, self._sample, seed)
+            run = replace(self.rollout, record=trace, policy=_Braking(self._policy, slot, at))
+            return one_world(run, lane_map, self.sample, seed)
 
         enable_compilation_cache()
         return jax.jit(one, compiler_options=compiler_options())
@@ -469,6 +473,7 @@ def _moments(seeds: NDArray[np.int64], metrics: Mapping[str, NDArray[np.float64]
         "near_miss": (m["min_ttc_time"], m["min_ttc"], nobody, m["min_ttc"] < NEAR_MISS[0]),
         "hard_brake": (m["max_drac_time"], m["max_drac"], nobody, m["max_drac"] > HARD),
         "unsafe": (m["rss_first_time"], nobody, nobody, m["rss_first_time"] >= 0),
+        "score_drop": (m["worst_second_time"], m["worst_second"], nobody, m["worst_second"] < SCORE_DROP),
     }
     rows = []
     for i, seed in enumerate(seeds.tolist()):

@@ -103,6 +103,7 @@ class Tick(NamedTuple):
     decision: Decision  # the one that this step follows
     x: Float[Array, " N"]  # m travelled since then
     dx: Float[Array, " N"]  # m of that in this step
+    command: Command  # of the egos, since then
 
 
 @jax.named_scope("decide")
@@ -303,7 +304,7 @@ def drive(
         state = replace(state, **fixed)
         state, dx, left = _step(config, traffic, lane_map, state, decision, x, command, free)
         x = x + dx
-        tick = Tick(state, left, config.time(state.step), decision, x, dx)
+        tick = Tick(state, left, config.time(state.step), decision, x, dx, command)
         return (bare(state), x), None if record is None else record(tick)
 
     before, x = state, mapped_like(state.s, jnp.zeros_like(state.s))

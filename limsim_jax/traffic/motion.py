@@ -75,6 +75,9 @@ def accelerations(
     v0 = jnp.minimum(decision.v0, reach)
     each, v, v_free = jax.tree.map(lambda value: value[None], (driver, state.v, v0))
     a = model(each, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free).min(0)
+    # the models only lag behind a desired speed that falls: who is above it brakes as hard as that takes
+    need = (state.v * state.v - decision.v_ahead**2) / (2 * jnp.maximum(room, 0.5))
+    a = jnp.where(state.v > reach, jnp.minimum(a, -jnp.clip(need, 0, driver.b)), a)
     # the models roll on slowly within s0: who is about to stand at a line stops before it
     line = jnp.where(index < 0, gap, NO_GAP).min(0) - driver.s0 + _BUMPER
     need = state.v * state.v / (2 * jnp.maximum(line, 0.02))
