@@ -1,6 +1,6 @@
 """How long sweeps take, and how much memory: the paper's five scenarios, and one scenario with many seeds.
 
-    python experiments/sweep_speed.py [--seeds 1000] [--more 2000]
+    python experiments/sweep_speed.py [--seeds 1000] [--more 10000]
 
 Every sweep is a process of its own with an empty compilation cache. Writes
 experiments/results/sweep_speed.json and .md.
@@ -84,7 +84,7 @@ def main() -> None:
     """Parse the command line, run, write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=1000)
-    parser.add_argument("--more", type=int, default=2000)
+    parser.add_argument("--more", type=int, default=10000)
     options = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as name:
