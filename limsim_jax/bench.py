@@ -494,7 +494,7 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
     import numpy as np
     from jax.sharding import Mesh, PartitionSpec
 
-    from limsim_jax.rollout import compiler_options, enable_compilation_cache, use_all_cores, world_key
+    from limsim_jax.rollout import enable_compilation_cache, use_all_cores, world_key
     from limsim_jax.sweep.episode import Episodes
     from limsim_jax.sweep.experiment import read_experiments
 
@@ -523,7 +523,7 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
     seeds = jnp.arange(worlds, dtype=jnp.int32)
     state, memory = jax.block_until_ready(jax.jit(over_worlds(begin, 1))(lane_map, seeds))
     start = time.perf_counter()
-    made = jax.jit(over_worlds(decide, 3), compiler_options=compiler_options())
+    made = jax.jit(over_worlds(decide, 3))
     compiled = made.lower(lane_map, state, memory, seeds).compile()
     compile_s = time.perf_counter() - start
     runs = []

@@ -38,7 +38,6 @@ from limsim_jax.rollout import (
     Totals,
     Trace,
     Worlds,
-    compiler_options,
     enable_compilation_cache,
     one_world,
     trace,
@@ -266,7 +265,7 @@ class Episodes:
             return one_world(run, lane_map, self.sample, seed)
 
         enable_compilation_cache()
-        return jax.jit(one, compiler_options=compiler_options())
+        return jax.jit(one)
 
 
 class _Braking:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -18,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.rollout import Carry, Rollout, compiler_options, enable_compilation_cache, world_key
+from limsim_jax.rollout import Carry, Rollout, enable_compilation_cache, world_key
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.types import Schedule
 
@@ -58,7 +57,7 @@ def stopped(episodes: Episodes, seed: int, times: Sequence[float]) -> Stopped:
     scenario = jax.jit(episodes.sample)(scenario_key)
     schedule = scenario.schedule
 
-    @partial(jax.jit, compiler_options=compiler_options())
+    @jax.jit
     def decide(lane_map: LaneMap, schedule: Schedule, carry: Carry) -> Carry:
         return bare.go_on(lane_map, schedule, key, carry, 1)[1]
 
