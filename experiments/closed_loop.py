@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from calibration import files
 
 from limsim_jax.calibration.closed_loop import (
     UNITS,
@@ -40,18 +41,15 @@ RESULTS = Path(__file__).parent / "results"
 SOURCES: dict[str, dict[str, Any]] = {
     "ngsim": {
         "title": "NGSIM I-80, human, congested",
-        "files": "ngsim_i80_*_pairs.csv.gz",
         "speed_limit": 29.0,  # 65 mph
     },
-    "openacc-acc": {"title": "OpenACC platoons, ACC", "files": "openacc_*.csv.gz", "period": 100.0},
+    "openacc-acc": {"title": "OpenACC platoons, ACC", "period": 100.0},
     "openacc-human": {
         "title": "OpenACC platoons, human",
-        "files": "openacc_*_no_ACC_*.csv.gz",
         "period": 100.0,
     },
     "us101": {
         "title": "US-101 scenes, human",
-        "files": "commonroad/USA_US101-*.xml.gz",
         "shortest": 6.0,
         "period": 20.0,
         "settle": 2.0,
@@ -60,13 +58,6 @@ SOURCES: dict[str, dict[str, Any]] = {
 }
 SATURATION = 1900.0
 """veh/h and lane, base saturation flow of the Highway Capacity Manual."""
-
-
-def files(folder: Path, name: str) -> list[Path]:
-    """Recordings of a data set."""
-    found = sorted(folder.glob(SOURCES[name]["files"]))
-    # Of the ACC recordings one is twelve minutes of three cars: all others would be padded to it.
-    return [p for p in found if name != "openacc-acc" or not any(x in p.name for x in ("no_ACC", "part10"))]
 
 
 def recordings(folder: Path, name: str) -> dict[str, Any]:

@@ -19,6 +19,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from readme_tables import sweep_speed
+
 RESULTS = Path(__file__).parent / "results"
 
 MANY = """
@@ -69,17 +71,6 @@ def sweep(experiment: str, seeds: int, folder: Path) -> dict[str, Any]:
     }
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Markdown."""
-    lines = ["| sweep | seeds | from command to table, s | peak memory, MB |", "|---|---:|---:|---:|"]
-    for row in rows:
-        name, seeds, wall, peak = row.values()
-        lines.append(f"| {name} | {seeds:,} | {wall:.0f} | {peak:,} |")
-    few, more = rows[0], rows[1]
-    seeds, seconds = more["seeds"] - few["seeds"], more["wall_s"] - few["wall_s"]
-    return "\n".join([*lines, "", f"{seeds:,} worlds more take {seconds:.0f} s more."])
-
-
 def main() -> None:
     """Parse the command line, run, write."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -96,7 +87,7 @@ def main() -> None:
             rows.append(sweep(str(experiment), seeds, folder))
     head = "Regenerate: `python experiments/sweep_speed.py`\n\n"
     (RESULTS / "sweep_speed.json").write_text(json.dumps({"sweeps": rows}, indent=1) + "\n")
-    (RESULTS / "sweep_speed.md").write_text(head + table(rows) + "\n")
+    (RESULTS / "sweep_speed.md").write_text(head + sweep_speed({"sweeps": rows}) + "\n")
 
 
 if __name__ == "__main__":

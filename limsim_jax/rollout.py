@@ -10,10 +10,13 @@ give the same bits. A run that is saved and resumed ends as one that was not.
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import io
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -29,7 +32,6 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from limsim_jax.files import write_whole
 from limsim_jax.maps.cache import directory
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
-from limsim_jax.maps.routing import FAR
 from limsim_jax.numerics import mapped_like
 from limsim_jax.policies.base import LikeTraffic, Policy
 from limsim_jax.traffic.collision import collided
@@ -173,9 +175,9 @@ def _to_go(lane_map: LaneMap, state: State) -> Float[Array, ""]:
     """Metres from the front bumper of the first ego to the end of its goal; NaN: gone, or no way there."""
     slot = state.egos.slot[0]
     lane = state.lane[slot]
-    distance = lane_map.routes.distance[lane, state.goal[slot]]
-    known = state.active[slot] & (lane != NO_LANE) & (distance < FAR)
-    return jnp.where(known, jnp.maximum(distance - state.s[slot], 0), jnp.nan)
+    routes, goal = lane_map.routes, state.goal[slot]
+    known = state.active[slot] & (lane != NO_LANE) & routes.reachable[lane, goal]
+    return jnp.where(known, jnp.maximum(routes.distance[lane, goal] - state.s[slot], 0), jnp.nan)
 
 
 @dataclass(frozen=True)
@@ -339,12 +341,38 @@ def world_key(seed: int | Int[Array, ""]) -> Key[Array, ""]:
     return jax.random.fold_in(jax.random.key(0), seed)
 
 
+class Started(NamedTuple):
+    """A world before its first decision, and all that `Rollout.go_on` needs beside the map."""
+
+    schedule: Schedule
+    key: Key[Array, ""]  # of the policy
+    carry: Carry
+
+
+def started(
+    run: Rollout, lane_map: LaneMap, sampler: Callable[[Key[Array, ""]], Scenario], seed: int | Int[Array, ""]
+) -> Started:
+    """Draw the scenario of a seed and put it on the map."""
+    scenario_key, policy_key = jax.random.split(world_key(seed))
+    scenario = sampler(scenario_key)
+    return Started(scenario.schedule, policy_key, run.begin(lane_map, scenario.start))
+
+
 def one_world(
     run: Rollout, lane_map: LaneMap, sampler: Callable[[Key[Array, ""]], Scenario], seed: int | Int[Array, ""]
 ) -> Result:
     """The world of a seed from start to end; the same whether it runs alone or in a batch."""
-    scenario_key, policy_key = jax.random.split(world_key(seed))
-    return run(lane_map, sampler(scenario_key), policy_key)
+    return run.go_on(lane_map, *started(run, lane_map, sampler, seed))[0]
+
+
+def run_once() -> dict[str, Any] | None:
+    """Compiler options for programs that run once per world, as `started`: compile fast, run slowly.
+
+    Two programs that are to agree to the last bit need the same options.
+    """
+    if jax.default_backend() != "cpu":
+        return None
+    return {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 
 class Worlds:
@@ -374,24 +402,36 @@ class Worlds:
         self.mesh = Mesh(np.array(devices), ("worlds",))
         self.lane_map = jax.device_put(lane_map, jax.sharding.NamedSharding(self.mesh, PartitionSpec()))
 
-        def one(lane_map: LaneMap, seed: Int[Array, ""]) -> Result:
-            return one_world(run, lane_map, sampler, seed)
+        everywhere, worlds = PartitionSpec(), PartitionSpec("worlds")
+        shardings = tuple(jax.sharding.NamedSharding(self.mesh, spec) for spec in (everywhere, worlds))
 
-        worlds = PartitionSpec("worlds")
-        self._run: Any = jax.jit(
-            jax.shard_map(
+        def over_worlds(one: Callable[[LaneMap, Any], Any], options: dict[str, Any] | None = None) -> Any:
+            many = jax.shard_map(
                 jax.vmap(one, in_axes=(None, 0)),
                 mesh=self.mesh,
-                in_specs=(PartitionSpec(), worlds),
+                in_specs=(everywhere, worlds),
                 out_specs=worlds,
                 check_vma=False,
-            ),
-        )
+            )
+            return jax.jit(many, in_shardings=shardings, out_shardings=shardings[1], compiler_options=options)
+
+        def start(lane_map: LaneMap, seed: Int[Array, ""]) -> Started:
+            return started(run, lane_map, sampler, seed)
+
+        def go_on(lane_map: LaneMap, world: Started) -> Result:
+            return run.go_on(lane_map, *world)[0]
+
+        self._start, self._go_on = over_worlds(start, run_once()), over_worlds(go_on)
 
     def compile(self) -> Worlds:
         """Compile now; else the first chunk does."""
         enable_compilation_cache()
-        self._run = self._run.lower(self.lane_map, jnp.zeros(self.chunk, jnp.int32)).compile()
+        seeds = jnp.zeros(self.chunk, jnp.int32)
+        with ThreadPoolExecutor(1) as pool, _no_collections():
+            start = self._start.lower(self.lane_map, seeds)
+            compiled = pool.submit(start.compile)  # while the other is traced and compiled
+            self._go_on = self._go_on.lower(self.lane_map, start.out_info).compile()
+            self._start = compiled.result()
         return self
 
     def chunks(self, seeds: Sequence[int]) -> Iterator[tuple[Sequence[int], Result]]:
@@ -405,13 +445,25 @@ class Worlds:
         for first in range(0, len(seeds), self.chunk):
             some = seeds[first : first + self.chunk]
             padded = np.array(some + [some[-1]] * (self.chunk - len(some)), np.int32)
-            result = jax.device_get(self._run(self.lane_map, padded))
+            result = jax.device_get(self._go_on(self.lane_map, self._start(self.lane_map, padded)))
             yield some, jax.tree.map(lambda x: x[: len(some)], result)  # noqa: B023
 
     def run_totals(self, seeds: Sequence[int]) -> Totals:
         """Totals of all worlds `[len(seeds)]`, on the host."""
         parts = [result.totals for _, result in self.chunks(seeds)]
         return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+@contextlib.contextmanager
+def _no_collections() -> Iterator[None]:
+    """Tracing makes millions of objects that stay: looking among them for garbage takes a third of it."""
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
 
 
 # --- branching, saving -------------------------------------------------------------------------------

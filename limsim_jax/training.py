@@ -30,7 +30,7 @@ from limsim_jax.policies.pdm_learned import (
     remember,
     save_weights,
 )
-from limsim_jax.rollout import enable_compilation_cache, world_key
+from limsim_jax.rollout import enable_compilation_cache, started
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.sweep.experiment import read_experiments
 from limsim_jax.traffic.engine import Command
@@ -157,10 +157,7 @@ def record(
         run = replace(run, policy=_Recorder(run.policy, run.decisions), measure=None)
 
         def one(lane_map: LaneMap, seed: jax.Array, run: Any = run, episodes: Any = episodes) -> _Memory:
-            scenario_key, key = jax.random.split(world_key(seed))
-            scenario = episodes.sample(scenario_key)
-            carry = run.begin(lane_map, scenario.start)
-            return run.go_on(lane_map, scenario.schedule, key, carry)[1].memory
+            return run.go_on(lane_map, *started(run, lane_map, episodes.sample, seed))[1].memory
 
         many = jax.jit(jax.vmap(one, in_axes=(None, 0)))
         for first in range(0, len(seeds), chunk):

@@ -265,3 +265,23 @@ def test_a_lane_change_that_the_lanes_ahead_cut_off_is_taken_back():
     assert int(trace["lane"][-1, 0]) == after[row, goal], "it stays on its own way"
     assert int(trace["side"][-1, 0]) == 0 and abs(float(trace["d"][-1, 0])) < 1e-3
     assert np.abs(np.diff(np.asarray(trace["d"])[:, 0])).max() < 0.2, "and glides back"
+
+
+@pytest.mark.parametrize("lead", [-7.0, -1.5, 0.0, 2.0])
+def test_two_abreast_swap_lanes(lead):
+    """Each needs the lane of the other: one falls back, nobody waits until it gives up its goal."""
+    network, lane_map = bundled("intersection")
+    rows = lane_rows(network)
+    right, left = rows["6_0_-2"], rows["6_0_-1"]
+    to_go = np.asarray(lane_map.routes.lanes_to_go)
+    lane = [right, left]
+    goal = [int(np.argmax(to_go[right] == 1)), int(np.argmax(to_go[left] == -1))]
+    end, trace = runner("intersection", Traffic(), 120)(
+        state_of("intersection", lane, [60.0, 60.0 + lead], [13.9, 14.4], goal)
+    )
+    changed = {int(x) for x in np.unique(np.asarray(trace["lane"])[:, 0])}
+    assert left in changed and right in {int(x) for x in np.unique(np.asarray(trace["lane"])[:, 1])}
+    assert not (np.asarray(end.status) & int(Status.MISSED_ROUTE)).any()
+    assert float(trace["apart"].min()) > 0 and float(trace["a"].min()) > -3.5
+    standing = (np.asarray(trace["v"]) < 0.1) & (np.asarray(trace["lane"]) == np.asarray(lane))
+    assert standing.sum(0).max() < 100  # of 600 steps of 0.1 s: no patience is tried

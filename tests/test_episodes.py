@@ -9,6 +9,7 @@ import pytest
 from limsim_jax.maps.lane_map import NO_LANE
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.metrics.safety import encounter, overlaps
+from limsim_jax.policies.simple import ConstantSpeed, FollowLane
 from limsim_jax.sweep.episode import Episodes, _moments, _succeeds
 from limsim_jax.sweep.experiment import Bounds, Experiment
 
@@ -84,6 +85,26 @@ def test_both_kinds_of_end_occur():
     contacts = [replayed("constant_speed", seed).metrics["contacts"] for seed in SEEDS]
     assert max(contacts) > 0, "else the test above tells little"
     assert all(replayed("like_traffic", seed).metrics["contacts"] == 0 for seed in SEEDS)
+
+
+class Modular(ConstantSpeed):
+    """As blind as before with one module replaced; with the other, it looks."""
+
+    def variants(self, seen):
+        return {"prediction": ConstantSpeed(), "planning": FollowLane()}
+
+
+def test_the_module_that_is_to_blame():
+    blind, modular = (episodes(name) for name in ("constant_speed", "test_episodes:Modular"))
+    hit = [seed for seed in SEEDS if replayed("constant_speed", seed).metrics["contacts"]]
+    for seed in hit[:2]:
+        row = modular.replay(seed).moments[0]
+        assert (row["kind"], row["module"]) == ("contact", "planning")
+        alone = replayed("constant_speed", seed).moments[0]
+        assert alone["module"] is None and alone["avoidable_by_ego"] == row["avoidable_by_ego"]
+    calm = next(seed for seed in SEEDS if not replayed("like_traffic", seed).metrics["contacts"])
+    assert not any(row.get("module") for row in replayed("like_traffic", calm).moments)
+    assert blind._references == {}
 
 
 @pytest.mark.parametrize("policy, seed", cases())

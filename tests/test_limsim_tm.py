@@ -1,6 +1,7 @@
 """LimSim-TM in the engine: corridors of real lanes, and an ego that gets through traffic."""
 
 import functools
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +10,15 @@ from traffic_worlds import bundled, drivers, shapes, state_of
 
 from limsim_jax.maps.lane_map import NO_LANE, lane_rows
 from limsim_jax.maps.routing import default_goals
+from limsim_jax.policies.area import AreaOfInterest
+from limsim_jax.policies.base import LikeTraffic, variants
 from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.limsim_tm.decide import corridor, grouped
 from limsim_jax.policies.limsim_tm.plan import room_needed
 from limsim_jax.policies.limsim_tm.search import Settings
+from limsim_jax.policies.pdm import PDMClosed
+from limsim_jax.policies.predict import straight
+from limsim_jax.policies.simple import FollowLane
 from limsim_jax.rollout import Rollout, one_world, trace
 from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, entries, sample_scenario
 from limsim_jax.traffic.engine import Traffic
@@ -95,3 +101,16 @@ def test_an_ego_gets_through_traffic():
     a = np.asarray(result.trace.a[:, :, 0])
     assert a.min() > -4.5 and a.max() < 3.0
     assert np.isfinite(result.trace.box).all()
+
+
+def test_each_module_has_a_reference():
+    policy = LimSimTM(others=2, search_every=2)
+    found = variants(policy, straight)
+    assert list(found) == ["prediction", "decision", "planning"]
+    assert found["prediction"] == replace(policy, predict=straight)
+    assert found["decision"] == replace(policy, search=None)
+    assert found["planning"] == FollowLane(others=2)
+    mine = variants(AreaOfInterest(around=policy, slots=2), straight)["decision"]
+    assert mine.ego == LimSimTM(search=None, search_every=2) and mine.around.search is not None
+    assert list(variants(PDMClosed(), straight)) == ["prediction", "planning"]
+    assert variants(LikeTraffic(), straight) == {}

@@ -9,7 +9,7 @@ import pytest
 from traffic_worlds import bundled, scattered
 
 from limsim_jax.maps.lane_map import width
-from limsim_jax.policies.predict import Plans, constant_velocity, hypotheses, nearest, straight
+from limsim_jax.policies.predict import Plans, Recalled, constant_velocity, hypotheses, nearest, straight
 from limsim_jax.traffic.motion import advance, boxes
 from limsim_jax.types import Config
 
@@ -58,6 +58,29 @@ def test_constant_velocity_is_what_the_engine_does_without_acceleration(name):
         off = off if k < 2 else np.remainder(off + np.pi, 2 * np.pi) - np.pi
         assert np.abs(np.where(active, off, 0)).max() < tolerance, k
     np.testing.assert_array_equal(found.length, state.shape.length)
+
+
+def test_what_came_to_pass_is_recalled_from_where_vehicles_are_now():
+    state, lane_map = world("highway"), bundled("highway")[1]
+    here = np.asarray(boxes(lane_map, state))
+    t = np.arange(1, 81)[:, None] * 0.1  # rows are after steps
+    box = np.tile(here, (80, 1, 1))
+    speeds = np.linspace(1.0, 12.0, N)
+    box[:, :, 0] += 100.0 + t * speeds - 0.3 * t * t
+    box[:, :, 2] += 0.02 * t
+    recall = Recalled(jnp.asarray(box, jnp.float32), 0.1)
+    at = 2.0  # s: the first run is known up to 8 s, so that the last of the times is past its end
+    found = recall(lane_map, dataclasses.replace(state, step=jnp.int32(20)), TIMES + 3.0)
+    later = np.minimum(at + np.asarray(TIMES) + 3.0, 8.0)
+
+    def way(t):
+        return speeds[:, None] * t - 0.3 * t * t
+
+    np.testing.assert_allclose(found.x, here[:, :1] + way(later) - way(np.float64(at)), atol=2e-3)
+    np.testing.assert_allclose(found.y, np.repeat(here[:, 1:2], len(later), 1), atol=1e-3)
+    np.testing.assert_allclose(
+        found.heading - here[:, 2:3], 0.02 * (later - at)[None].repeat(N, 0), atol=1e-4
+    )
 
 
 def test_offset_fades_and_stop_is_kept():

@@ -6,7 +6,6 @@ A user's error is one line on stderr and exit code 2. A bug is a traceback.
 from __future__ import annotations
 
 import copy
-import errno
 import json
 import math
 import os
@@ -20,6 +19,7 @@ import typer
 
 from limsim_jax import __version__
 from limsim_jax.cli import fitting, results
+from limsim_jax.files import check_writable
 
 if TYPE_CHECKING:
     from limsim_jax.maps.network import ImportReport, Network
@@ -231,9 +231,7 @@ def run(
         raise typer.BadParameter(message, param_hint="--vehicles")
     window = None if bounds is None else _window(bounds)
     _check_outputs(video, picture, trace_file)
-    for path in (video, picture, trace_file, json_file):
-        if path is not None:
-            _check_writable(path)
+    check_writable(video, picture, trace_file, json_file)
     network = _load(file, no_cache=False)
 
     import jax
@@ -336,8 +334,7 @@ def traffic(
     for name, value in (("--seconds", seconds), ("--rate", rate)):
         if not math.isfinite(value):
             raise typer.BadParameter(f"{value:g}; it has to be finite", param_hint=name)
-    if json_file is not None:
-        _check_writable(json_file)
+    check_writable(json_file)
     result = bench_traffic(
         _path(file), worlds=worlds, vehicles=vehicles, seconds=seconds, repeats=repeats, rate=rate,
         peer=not no_peer, cold=cold,
@@ -363,8 +360,7 @@ def policy(
     from limsim_jax.sweep.episode import Episodes
     from limsim_jax.sweep.experiment import read_experiments
 
-    if json_file is not None:
-        _check_writable(json_file)
+    check_writable(json_file)
     read = read_experiments(experiment, policy=name)
     if len(read) != 1:
         raise typer.BadParameter(f"'{experiment}' is {len(read)} experiments; name one of them")
@@ -424,20 +420,6 @@ def _check_outputs(video: Path | None, picture: Path | None, trace_file: Path | 
             raise ModuleNotFoundError(
                 f"'{trace_file}' needs pyarrow: pip install pyarrow, or write .npz"
             ) from None
-
-
-def _check_writable(path: Path) -> None:
-    """Raise `OSError` about a file that cannot be written."""
-    target = path if path.exists() else path.parent
-    if path.is_dir():
-        code = errno.EISDIR
-    elif not path.parent.is_dir():
-        code = errno.ENOTDIR if path.parent.exists() else errno.ENOENT
-    elif not os.access(target, os.W_OK):
-        code = errno.EACCES
-    else:
-        return
-    raise OSError(code, os.strerror(code), str(path))
 
 
 def _outcome(totals: Totals) -> dict[str, Any]:

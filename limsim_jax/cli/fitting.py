@@ -7,18 +7,13 @@ from typing import Annotated, Literal
 
 import typer
 
+from limsim_jax.files import check_writable
+
 
 def add_commands(app: typer.Typer) -> None:
     """Add `calibrate` and `train`."""
     app.command()(calibrate)
     app.command()(train)
-
-
-def _check_folders(*files: Path | None) -> None:
-    """What cannot be written later is refused now."""
-    for file in files:
-        if file is not None and not file.parent.is_dir():
-            raise typer.BadParameter(f"{file}: there is no folder '{file.parent}'")
 
 
 def calibrate(
@@ -65,7 +60,7 @@ def calibrate(
     from limsim_jax.files import write_whole
     from limsim_jax.rollout import enable_compilation_cache
 
-    _check_folders(out, json_file)
+    check_writable(out, json_file)
     if not 10 <= period < float("inf"):
         raise typer.BadParameter(f"{period:g} s; at least 10", param_hint="--period")
     enable_compilation_cache()
@@ -102,7 +97,7 @@ def train(
     from limsim_jax.rollout import enable_compilation_cache, use_all_cores
     from limsim_jax.training import train as fit
 
-    _check_folders(out)
+    check_writable(out)
     if seeds < 1:
         raise typer.BadParameter(f"{seeds} seeds; at least 1", param_hint="--seeds")
     use_all_cores()

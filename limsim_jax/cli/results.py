@@ -231,7 +231,8 @@ def replay(
         who = f", responsible: {row['responsible']}" if row["responsible"] else ""
         able = [name for name in ("ego", "other") if row.get(f"avoidable_by_{name}")]
         saved = f", had braked in time, would have avoided it: {' or '.join(able)}" if able else ""
-        print(f"{row['time']:6.1f} s  {row['kind']}{value}{who}{saved}")
+        module = f", avoided by a reference {row['module']} module" if row.get("module") else ""
+        print(f"{row['time']:6.1f} s  {row['kind']}{value}{who}{saved}{module}")
     stored = _stored(opened, group, seed)
     if stored is not None and (differs := [x for x in metrics if not _alike(metrics[x], stored[x])]):
         print(f"note: not the episode that is stored: {', '.join(differs[:3])} differ; 'verify' may tell why")

@@ -201,25 +201,21 @@ def sight_of(
     return k.astype(x.dtype) * GRID + ahead, beside, jnp.cos(turn), jnp.sin(turn)
 
 
-def separation(
-    dx: Float[Array, "*#b"],
-    dy: Float[Array, "*#b"],
-    angle: tuple[Float[Array, "*#b"], Float[Array, "*#b"]],
-    own: tuple[Float[Array, "*#b"], Float[Array, "*#b"]],
-    other: tuple[Float[Array, "*#b"], Float[Array, "*#b"]],
-) -> tuple[Float[Array, "*#b"], Float[Array, "*#b"]]:
-    """Gaps along and across a body to another one, m: they are apart if one of them is positive.
+def separation(length: Any, width: Any, dx: Any, dy: Any, angle: tuple[Any, Any]) -> tuple[Any, Any]:
+    """Gaps along and across every body i to every body j, `[i, j]`, m; of NumPy arrays or of JAX's.
+
+    They are apart if one of the gaps is positive; not if none is in the frames of both (separating axes).
 
     Args:
-      dx: m, to the middle of the other, ahead in the frame of the own body; `dy`: to the left.
-      dy: see `dx`.
+      length: m, `[N]`.
+      width: m, `[N]`.
+      dx: m, to the middle of j, ahead in the frame of i, `[i, j]`.
+      dy: to the left.
       angle: cos and sin of the angle between them.
-      own: length and width, m.
-      other: length and width, m.
     """
-    cos, sin = jnp.abs(angle[0]), jnp.abs(angle[1])
-    along = jnp.abs(dx) - (own[0] + cos * other[0] + sin * other[1]) / 2
-    across = jnp.abs(dy) - (own[1] + sin * other[0] + cos * other[1]) / 2
+    cos, sin = abs(angle[0]), abs(angle[1])
+    along = abs(dx) - (length[:, None] + cos * length[None, :] + sin * width[None, :]) / 2
+    across = abs(dy) - (width[:, None] + sin * length[None, :] + cos * width[None, :]) / 2
     return along, across
 
 
@@ -324,9 +320,8 @@ def _clearance(pose: Floats, length: Floats, width: Floats, valid: NDArray[np.bo
     """[i, j]: the larger of the gaps of `separation` of body j in the frame of body i, m."""
     dx, dy, turn = (pose[None, :, k] - pose[:, None, k] for k in range(3))
     cos, sin = np.cos(pose[:, None, 2]), np.sin(pose[:, None, 2])
-    c, s = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    along = np.abs(cos * dx + sin * dy) - (length[:, None] + c * length + s * width) / 2
-    across = np.abs(cos * dy - sin * dx) - (width[:, None] + s * length + c * width) / 2
+    angle = np.cos(turn), np.sin(turn)
+    along, across = separation(length, width, cos * dx + sin * dy, cos * dy - sin * dx, angle)
     both = valid[:, None] & valid[None, :] & ~np.eye(len(pose), dtype=bool)
     return np.where(both, np.maximum(along, across), FAR)
 

@@ -26,7 +26,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from limsim_jax.log_replay.scene import MARGIN, Scene, Sight, pose, sight, sight_of
+from limsim_jax.log_replay.scene import MARGIN, Scene, Sight, pose, separation, sight, sight_of
 from limsim_jax.numerics import mapped_like
 from limsim_jax.traffic.car_following import ACC, IDM, NO_GAP, CarFollowing, ballistic
 
@@ -506,17 +506,11 @@ def _meets(
 def _bodies(
     scene: Scene, own: tuple[Array, ...], other: tuple[Array, ...]
 ) -> tuple[Float[Array, "N N"], Float[Array, "N N"], Float[Array, "N N"]]:
-    """Body j in the frame of body i, `[i, j]`: gap along it and beside it, and how far ahead, m.
-
-    They are apart if one of the gaps is positive; not if none is in the frames of both (separating axes).
-    """
-    length, width = scene.log.length, scene.log.width
+    """Body j in the frame of body i, `[i, j]`: gaps of `separation`, and how far ahead, m."""
     dx, dy, turn = (b[None, :] - a[:, None] for a, b in zip(own, other, strict=True))
     cos, sin = jnp.cos(own[2])[:, None], jnp.sin(own[2])[:, None]
-    c, s = jnp.abs(jnp.cos(turn)), jnp.abs(jnp.sin(turn))
-    front = cos * dx + sin * dy
-    gap = jnp.abs(front) - (length[:, None] + c * length[None, :] + s * width[None, :]) / 2
-    beside = jnp.abs(cos * dy - sin * dx) - (width[:, None] + s * length[None, :] + c * width[None, :]) / 2
+    front, angle = cos * dx + sin * dy, (jnp.cos(turn), jnp.sin(turn))
+    gap, beside = separation(scene.log.length, scene.log.width, front, cos * dy - sin * dx, angle)
     return gap, beside, front
 
 

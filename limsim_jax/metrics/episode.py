@@ -300,11 +300,11 @@ class EgoMetrics:
 
         # --- time to collision, distances
         begin, cease = contact_interval(e)
-        ttc = first_touch(begin, cease)
+        ttc, touches = first_touch(begin, cease), (begin <= 0) & (cease >= 0)
         touched = carry.contact.touched
         apart = there & ~touched
         # who touches, or is near an ego that leaves its lane, counts whatever way both meant to go
-        meets = step.relevant | step.changing[step.slot] | ((begin <= 0) & (cease >= 0))
+        meets = step.relevant | step.changing[step.slot] | touches
         ttc_2d = jnp.min(jnp.where(apart & meets, ttc, NONE))
         has_lead = (step.lead >= 0) & step.active[step.lead]
         gap = jnp.where(has_lead, step.lead_gap, NO_GAP)
@@ -312,7 +312,7 @@ class EgoMetrics:
         ttc_lead = jnp.where(has_lead & ~touched[step.lead], ttc_1d(gap, step.v, v_lead), NONE)
         least = jnp.minimum(ttc_2d, ttc_lead)
         thw = time_headway(gap, step.v)
-        nearest = jnp.min(jnp.where(apart, distance(e, (begin <= 0) & (cease >= 0)), NO_GAP))
+        nearest = jnp.min(jnp.where(apart, distance(e, touches), NO_GAP))
 
         # --- contacts and near misses
         contact = contact_update(

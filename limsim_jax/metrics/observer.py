@@ -30,7 +30,6 @@ AT_RED = 15.0
 
 _STANDS = 0.5  # m/s
 _ON_LINE = 0.5  # m beyond the stop line from which who starts does not cross it
-_FAR = 1e8  # m: a goal is not that far; it cannot be reached
 
 
 class Look(NamedTuple):
@@ -72,7 +71,8 @@ class EvaluateEgo:
         ego, traffic = self._judges(config)
         slots, slot = state.lane.shape[0], state.egos.slot[0]
         nothing = jnp.zeros(slots, jnp.float32)
-        first = _look(lane_map, state, state.active & False, jnp.zeros((), jnp.float32), nothing)
+        nobody = state.active & False
+        first = _look(lane_map, state, nobody, nobody, jnp.zeros((), jnp.float32), nothing)
         carry = Judged(
             ego=ego.init(slots, first.ego.zones.id.shape[0]),
             traffic=traffic.init(slots, 0),
@@ -85,7 +85,10 @@ class EvaluateEgo:
 
     def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Look:
         """What the metrics need to know of a physics step."""
-        look = _look(lane_map, tick.state, tick.left, tick.time, tick.dx)
+        off = tick.off_road
+        if off is None:
+            off = off_road(lane_map, tick.state, boxes(lane_map, tick.state))
+        look = _look(lane_map, tick.state, tick.left, off, tick.time, tick.dx)
         slot = tick.state.egos.slot[0]
         other, gap = (x[slot, 0] for x in tick.decision.obstacles)
         gap = gap + tick.x[other] - tick.x[slot]
@@ -115,14 +118,14 @@ class EvaluateEgo:
         routes = lane_map.routes
         # who leaves the map is on no lane any more
         leaves = look.traffic.left[slot] & routes.is_goal[carry.lane, carry.goal]
-        distance = routes.distance[lane, carry.goal]
+        on_route = routes.reachable[lane, carry.goal]
         reached = seen.arrived & routes.is_goal[lane, carry.goal]
-        to_go = jnp.where((lane != NO_LANE) & (distance < _FAR), distance - s, carry.to_go)
+        to_go = jnp.where((lane != NO_LANE) & on_route, routes.distance[lane, carry.goal] - s, carry.to_go)
         to_go = jnp.where(leaves | reached, 0, to_go)
         seen = seen._replace(
             relevant=relevant,
             to_go=to_go,
-            on_route=distance < _FAR,
+            on_route=on_route,
             arrived=leaves | reached,
             stop_sign=seen.stop_sign & ~carry.stopped,
         )
@@ -151,6 +154,7 @@ def _look(
     lane_map: LaneMap,
     state: State,
     left: Bool[Array, " N"],
+    off: Bool[Array, " N"],
     t: Float[Array, ""],
     dx: Float[Array, " N"],
 ) -> Look:
@@ -179,7 +183,6 @@ def _look(
     # the road at the ego
     at, at_s = body_place(lane_map, lane, state.previous[slot], s, state.shape.length[slot])
     heading = pose(lane_map, at, at_s)[2]
-    off = off_road(lane_map, state, box)
     half = width(lane_map, state.lane, state.s) / 2
     straddles = jnp.abs(state.d) + state.shape.width / 2 > half
     sides = [lane, lane_map.left[lane], lane_map.right[lane]]

@@ -16,7 +16,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.base import Policy
+from limsim_jax.policies.base import Policy, variants
+from limsim_jax.policies.predict import Predictor
 from limsim_jax.traffic.ego import Egos, Trajectory, assign
 from limsim_jax.traffic.engine import Command
 from limsim_jax.traffic.motion import boxes
@@ -73,6 +74,13 @@ class AreaOfInterest:
         if self.ego is not None:
             object.__setattr__(self, "ego", _named(self.ego, {}))
             object.__setattr__(self, "free", self.ego.free)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def variants(self, seen: Predictor) -> dict[str, Policy]:
+        """With a reference in the place of a module of the egos' planner; who is around keeps its own."""
+        policy = self.around if self.ego is None else self.ego
+        if is_dataclass(policy) and any(f.name == "others" for f in fields(policy)):
+            policy = replace(policy, others=0)
+        return {name: replace(self, ego=other) for name, other in variants(policy, seen).items()}
 
     @property
     def others(self) -> int:

@@ -8,6 +8,7 @@ import jax
 from jaxtyping import Array, Key
 
 from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.policies.predict import Predictor
 from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, State
 
@@ -34,6 +35,16 @@ class Policy(Protocol):
     ) -> tuple[Command, Any]:
         """What the egos do until the next decision, and the new memory. `key` is of this decision."""
         ...
+
+
+def variants(policy: Any, seen: Predictor) -> dict[str, Policy]:
+    """The policy with a reference in the place of one module, by what the module does; or nothing.
+
+    That is asked for after a failure: a module is to blame if its reference would have avoided it. A policy
+    that is made of modules has a method of this name. `seen` predicts what came to pass.
+    """
+    found = getattr(policy, "variants", None)
+    return {} if found is None else found(seen)
 
 
 class LikeTraffic:

@@ -34,7 +34,7 @@ Paths are laid anew at every decision, in both.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -48,8 +48,10 @@ from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.numerics import computed_once, mapped_like, safe_norm
+from limsim_jax.policies.base import Policy
 from limsim_jax.policies.predict import Predictor, nearest, straight
 from limsim_jax.policies.reference import Place, Way, place_on, way_ahead
+from limsim_jax.policies.simple import FollowLane
 from limsim_jax.traffic.collision import OVERHANG
 from limsim_jax.traffic.ego import Trajectory
 from limsim_jax.traffic.engine import Command
@@ -932,6 +934,10 @@ class PDMClosed:
     def __post_init__(self) -> None:
         if self.seen < 1:
             raise ValueError(f"seen: {self.seen} others; at least 1")
+
+    def variants(self, seen: Predictor) -> dict[str, Policy]:
+        """With a reference in the place of a module: what came to pass, car following on its lane."""
+        return {"prediction": replace(self, predict=seen), "planning": FollowLane()}
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         """Nothing to remember."""

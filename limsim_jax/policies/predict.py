@@ -1,12 +1,13 @@
 """Where others will be: predictions of all vehicles as arrays, for planners to keep clear of.
 
-A `Predictor` is a function; a planner takes any. Two are here: `constant_velocity` along the route, and
-`straight` along the heading, as in PDM (Dauner et al., CoRL 2023). `hypotheses` has several futures of a
-vehicle where lanes split. Without gradient through which lane a vehicle is on.
+A `Predictor` is a function; a planner takes any. Here are: `constant_velocity` along the route, `straight`
+along the heading, as in PDM (Dauner et al., CoRL 2023), and `Recalled`, what came to pass. `hypotheses` has
+several futures of a vehicle where lanes split. Without gradient through which lane a vehicle is on.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import jax
@@ -132,6 +133,44 @@ def straight(
 
 
 @jax.named_scope("hypotheses")
+@dataclass(frozen=True)
+class Recalled:
+    """What came to pass: a predictor for worlds that run a second time.
+
+    Each vehicle moves as it did in the first run, from where it is now. A slot that another vehicle took
+    meanwhile goes on with that one's motion.
+
+    Attributes:
+      box: `[T, N, 5]` of the first run as in `rollout.Trace`, after every physics step.
+      dt: s from one to the next.
+    """
+
+    box: Float[Array, "T N 5"]
+    dt: float
+
+    def __call__(
+        self,
+        lane_map: LaneMap,
+        state: State,
+        times: Float[Array, " H"],
+        *,
+        stop: Float[Array, " N"] | None = None,
+        plans: Plans | None = None,
+    ) -> Prediction:
+        """Where all vehicles were `times` s later; `stop` is not needed."""
+        del stop
+        last = self.box.shape[0] - 1
+        now = state.step - 1  # the first row is after the first step
+        then = jnp.clip(now + jnp.round(times / self.dt).astype(jnp.int32), 0, last)
+        moved = jnp.moveaxis(self.box[then, :, :3] - self.box[jnp.clip(now, 0, last), :, :3], 0, 1)  # [N H 3]
+        x, y, heading = (boxes(lane_map, state)[:, k, None] + moved[..., k] for k in range(3))
+        shape = state.shape
+        prediction = Prediction(
+            x=x, y=y, heading=heading, length=shape.length, width=shape.width, times=times
+        )
+        return _with(prediction, plans)
+
+
 def hypotheses(
     lane_map: LaneMap,
     state: State,

@@ -411,7 +411,7 @@ def _replayed(
         for caption, png in views
     )
     worst = next((m for m in moments if m["kind"] == row["kind"]), {})
-    found = {key: worst[key] for key in ("avoidable_by_ego", "avoidable_by_other") if key in worst}
+    found = {key: worst[key] for key in ("avoidable_by_ego", "avoidable_by_other", "module") if key in worst}
     return f'<div class="views">{figures}</div>', f"replays/{quote(name)}", found
 
 

@@ -9,7 +9,7 @@ import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,15 +31,19 @@ from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import NEAR_MISS, Rss
 from limsim_jax.metrics.traffic import NAMES as TRAFFIC_NAMES
 from limsim_jax.policies import POLICIES
-from limsim_jax.policies.base import Policy
+from limsim_jax.policies.base import Policy, variants
+from limsim_jax.policies.predict import Recalled, straight
 from limsim_jax.rollout import (
+    Carry,
     Result,
     Rollout,
+    Started,
     Totals,
     Trace,
     Worlds,
     enable_compilation_cache,
-    one_world,
+    run_once,
+    started,
     trace,
 )
 from limsim_jax.sweep.experiment import Bounds, EgoTable, Experiment, ExperimentError
@@ -85,7 +89,8 @@ _TOTALS = {
 }
 _SHARE_OF_MEMORY = 0.25
 _TEMPORARIES = 12  # a world needs so many times the memory of its arrays while it runs
-_CHUNKS = {"cpu": 64, "gpu": 2048, "tpu": 2048}  # worlds per call, if memory allows
+_CHUNKS = {"cpu": 50, "gpu": 2000, "tpu": 2000}
+"""Worlds per call, if memory allows: round numbers of seeds leave no chunk half empty."""
 
 
 class Replay(NamedTuple):
@@ -112,7 +117,7 @@ class Episodes:
 
     Args:
       experiment: what to run.
-      chunk: worlds per call; by default as many as memory allows, at most 64 on CPUs and 2048 on others.
+      chunk: worlds per call; by default as many as memory allows, at most 50 on CPUs and 2000 on others.
 
     Raises:
       ExperimentError: the experiment does not fit its map or names what is not there; one line.
@@ -170,8 +175,9 @@ class Episodes:
         else:
             memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         most = int(_SHARE_OF_MEMORY * memory / self.world_bytes)
-        wanted = _CHUNKS.get(device.platform, 64)
-        return max(1, 2 ** int(math.log2(max(1, min(most, wanted)))))
+        most = max(1, min(most, _CHUNKS.get(device.platform, 50)))
+        size = 10 ** (len(str(most)) - 1)
+        return max(k * size for k in (1, 2, 5) if k * size <= most)
 
     def provenance(self) -> dict[str, Any]:
         """Where the rows come from."""
@@ -233,7 +239,10 @@ class Episodes:
 
         After a contact the world is run twice more, in which the ego, or the other vehicle, brakes as hard as
         it can from the response time of RSS after the first unsafe moment on (at most `UNSAFE` s before the
-        contact): who could have avoided it?
+        contact): who could have avoided it? After a contact, a place off the road or a red light that was
+        run, a policy made of modules (`policies.base.variants`) drives again from that moment on (`UNSAFE` s
+        before, where it is none of distance) with a reference in the place of each: which would have avoided
+        it, at least for `UNSAFE` s more?
         """
         result = self._again(seed)
         metrics = self._columns(result.measures, result.totals)
@@ -241,31 +250,79 @@ class Episodes:
         columns = {name: column.tolist() for name, column in moments.items()}
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         found = {name: float(x[0]) for name, x in metrics.items()}
-        if rows and rows[0]["kind"] == "contact":
-            contact, unsafe = found["contact_time"], found["rss_first_time"]
-            start = max(contact - UNSAFE, 0.0 if np.isnan(unsafe) else min(unsafe, contact))
-            for who, slot in (("ego", 0), ("other", int(found["contact_other"]))):
-                changed = self._again(seed, slot, start + Rss().response)
-                measures = on_host(changed.measures)
-                same = measures["contact_other"][0] == found["contact_other"]
-                later = measures["contact_time"][0] > contact + UNSAFE
-                rows[0][f"avoidable_by_{who}"] = bool(measures["contacts"][0] == 0 or not same or later)
+        worst = rows[0]["kind"] if rows else None
+        if worst in ("contact", "off_road", "red_light"):
+            event, unsafe = found[f"{worst}_time"], found["rss_first_time"]
+            start = max(event - UNSAFE, 0.0)
+            if worst == "contact":
+                start = max(start, 0.0 if np.isnan(unsafe) else min(unsafe, event))
+                for who, slot in (("ego", 0), ("other", int(found["contact_other"]))):
+                    changed = self._again(seed, slot, start + Rss().response)
+                    measures = on_host(changed.measures)
+                    same = measures["contact_other"][0] == found["contact_other"]
+                    later = measures["contact_time"][0] > event + UNSAFE
+                    rows[0][f"avoidable_by_{who}"] = bool(measures["contacts"][0] == 0 or not same or later)
+            blamed = self._modules_to_blame(seed, worst, start, event + UNSAFE, result.trace)
+            rows[0]["module"] = " or ".join(blamed) or None
         return Replay(self.network, self.lane_map, result.trace, 0, rows, found)
 
     def _again(self, seed: int, slot: int = -1, at: float = np.inf) -> Result:
         """One world, every step; the vehicle in `slot` brakes from `at` s on."""
-        result = jax.device_get(self._one(self.lane_map, np.int32(seed), np.int32(slot), np.float32(at)))
+        start, go_on = self._one
+        world = start(self.lane_map, np.int32(seed))
+        result = jax.device_get(go_on(self.lane_map, world, np.int32(slot), np.float32(at)))
         single = jax.tree.map(lambda x: x[None], (result.measures, result.totals))
         return result._replace(measures=single[0], totals=single[1])
 
     @cached_property
-    def _one(self) -> Callable[..., Result]:
-        def one(lane_map: LaneMap, seed: jax.Array, slot: jax.Array, at: jax.Array) -> Result:
+    def _references(self) -> dict[str, Callable[..., Any]]:
+        """For each module of the policy: metrics of a world with the reference in its place.
+
+        For `first` decisions the policy is the own one, for `more` the other one.
+        """
+
+        def go_on(
+            module: str, lane_map: LaneMap, world: Started, first: jax.Array, more: jax.Array, box: jax.Array
+        ) -> Any:
+            def decisions(run: Rollout, count: jax.Array, carry: Carry) -> Carry:
+                def one(_: Any, carry: Carry) -> Carry:
+                    return run.go_on(lane_map, world.schedule, world.key, carry, 1)[1]
+
+                return jax.lax.fori_loop(0, count, one, carry)
+
+            run = self.rollout
+            carry = decisions(run, first, world.carry)
+            other = variants(self._policy, Recalled(box, run.config.dt))[module]
+            carry = carry._replace(memory=other.init(run.config, lane_map, carry.state))
+            carry = decisions(replace(run, policy=other), more, carry)
+            return EvaluateEgo().result(run.config, lane_map, carry.measured)
+
+        return {module: jax.jit(partial(go_on, module)) for module in variants(self._policy, straight)}
+
+    def _modules_to_blame(self, seed: int, kind: str, start: float, end: float, seen: Trace) -> list[str]:
+        """Modules of the policy whose references, in their places from `start` s on, avoid it until `end`."""
+        every = self.rollout.config.decision_time
+        first = int(start / every)
+        more = min(math.ceil(end / every), self.rollout.decisions) - first
+        world = self._one[0](self.lane_map, np.int32(seed))
+        found = []
+        for module, go_on in self._references.items():
+            measures = go_on(self.lane_map, world, np.int32(first), np.int32(more), seen.box)
+            if on_host(measures)[f"{kind}_time"] is None:
+                found.append(module)
+        return found
+
+    @cached_property
+    def _one(self) -> tuple[Callable[..., Started], Callable[..., Result]]:
+        def start(lane_map: LaneMap, seed: jax.Array) -> Started:
+            return started(self.rollout, lane_map, self.sample, seed)
+
+        def go_on(lane_map: LaneMap, world: Started, slot: jax.Array, at: jax.Array) -> Result:
             run = replace(self.rollout, record=trace, policy=_Braking(self._policy, slot, at))
-            return one_world(run, lane_map, self.sample, seed)
+            return run.go_on(lane_map, *world)[0]
 
         enable_compilation_cache()
-        return jax.jit(one)
+        return jax.jit(start, compiler_options=run_once()), jax.jit(go_on)
 
 
 class _Braking:
@@ -356,7 +413,9 @@ def _ego(
     except ValueError as error:
         raise ExperimentError(f"{name}: ego: {error}") from None
     vehicle = jnp.argmax(population.share)[None].astype(jnp.int32)
-    driver, shape = sample_vehicles(population, jax.random.key(0), jnp.zeros(1, jnp.int32), vehicle)
+    # compiled as one: operation by operation it takes seconds
+    sample = jax.jit(sample_vehicles, compiler_options=run_once())
+    driver, shape = sample(population, jax.random.key(0), jnp.zeros(1, jnp.int32), vehicle)
     common = {"driver": driver, "shape": shape, "free": jnp.asarray([free])}
     common["v"] = None if ego.v is None else jnp.asarray([ego.v], jnp.float32)
     if ego.start == "random":

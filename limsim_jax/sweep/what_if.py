@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.rollout import Carry, Rollout, enable_compilation_cache, world_key
+from limsim_jax.rollout import Carry, Rollout, enable_compilation_cache, run_once, started
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.types import Schedule
 
@@ -53,15 +53,14 @@ def stopped(episodes: Episodes, seed: int, times: Sequence[float]) -> Stopped:
         )
     enable_compilation_cache()
     bare = replace(run, measure=None, record=None)
-    scenario_key, key = jax.random.split(world_key(seed))
-    scenario = jax.jit(episodes.sample)(scenario_key)
-    schedule = scenario.schedule
+    first = jax.jit(lambda seed: started(bare, lane_map, episodes.sample, seed), compiler_options=run_once())
+    schedule, key, begun = first(seed)
 
     @jax.jit
     def decide(lane_map: LaneMap, schedule: Schedule, carry: Carry) -> Carry:
         return bare.go_on(lane_map, schedule, key, carry, 1)[1]
 
-    carries = [jax.jit(bare.begin)(lane_map, scenario.start)]
+    carries = [begun]
     for _ in range(max(wanted)):
         carries.append(decide(lane_map, schedule, carries[-1]))
     then = jax.tree.map(lambda *x: jnp.stack(x), *(carries[k] for k in wanted))

@@ -177,18 +177,21 @@ def _separation(a: _Bodies, b: _Bodies) -> Float[Array, " N"]:
 # ---- the road
 
 
-def off_road(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bool[Array, " N"]:
+def off_road(
+    lane_map: LaneMap, state: State, box: Float[Array, "N 5"], *, free: bool = True
+) -> Bool[Array, " N"]:
     """Vehicles with a part of the body more than `OVERHANG` beyond the lanes for motor traffic.
 
     Traffic that keeps to lanes: from the offset on its lane and the widths of that and the neighbour, not
     counting what a body is wider than its lane. Free egos: every corner of the box, against the lane and
     its neighbours, else against the nearest lane of the map and its neighbours. Shoulders are no road, and
-    in a junction only its lanes are; at the edge of the map the road is taken to go on.
+    in a junction only its lanes are; at the edge of the map the road is taken to go on. `free`: False is for
+    worlds without free egos, and compiles much faster.
     """
     half, own = state.shape.width / 2, width(lane_map, state.lane, state.s) / 2
     edge = jnp.maximum(own, half) + _beside(lane_map, state.lane, state.s, jnp.where(state.d > 0, 1, -1))
     off = state.active & (jnp.abs(state.d) + half > edge + OVERHANG)
-    if state.egos.slot.shape[0] == 0:
+    if not free or state.egos.slot.shape[0] == 0:
         return off
     return at_slots(state.egos, _corner_off(lane_map, state, box), off, state.egos.free) & state.active
 
@@ -288,8 +291,12 @@ def wrong_way(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bool
 # ---- what has happened
 
 
-def record(config: Config, lane_map: LaneMap, state: State) -> State:
+def record(
+    config: Config, lane_map: LaneMap, state: State, *, free: bool = True
+) -> tuple[State, Bool[Array, " N"]]:
     """Write down contacts, places off the road, wrong ways and broken numbers as of now.
+
+    Returns also who is off the road. `free`: False is for worlds without free egos.
 
     Sets bits of `status`; `struck` and `struck_at` tell of the first contact only, and of the slot: a
     vehicle that enters there later is another one. Nobody is moved or removed.
@@ -300,20 +307,23 @@ def record(config: Config, lane_map: LaneMap, state: State) -> State:
     first = hit & (state.struck < 0)
     numbers = jnp.stack([state.s, state.d, state.v, state.a], -1)
     broken = state.active & ~(jnp.isfinite(numbers).all(-1) & jnp.isfinite(box).all(-1))
+    off = computed_once(off_road(lane_map, state, box, free=free))
+    wrong = wrong_way(lane_map, state, box) if free else jnp.zeros_like(off)
     status = state.status
     for which, bit in (
         (hit, Status.COLLIDED),
-        (computed_once(off_road(lane_map, state, box)), Status.OFF_ROAD),
-        (wrong_way(lane_map, state, box), Status.WRONG_WAY),
+        (off, Status.OFF_ROAD),
+        (wrong, Status.WRONG_WAY),
         (broken, Status.NOT_FINITE),
     ):
         status |= jnp.where(which, int(bit), 0)
-    return replace(
+    after = replace(
         state,
         status=status,
         struck=jnp.where(first, touched, state.struck),
         struck_at=jnp.where(first, config.time(state.step), state.struck_at),
     )
+    return after, off
 
 
 def level(lane_map: LaneMap, state: State) -> Float[Array, " N"]:

@@ -63,6 +63,7 @@ AT_END = 40.0
 """m from the end of a lane within which that counts."""
 
 _BEND_POINTS = 4  # places ahead on the own lane at which the bend is looked at
+_GENTLY = 2.5  # m/s^2
 _WALL = 1.0  # m before the end of a lane that leads nowhere
 _WALL_ROOM = 25.0  # m before it, kept free to change lanes from a standstill
 
@@ -99,6 +100,7 @@ class Tick(NamedTuple):
 
     state: State
     left: Bool[Array, " N"]  # has left at the end of its goal in this step
+    off_road: Bool[Array, " N"] | None  # as `collision.off_road`; None: it is looked for at decisions only
     time: Float[Array, ""]  # s since the start, after the step
     decision: Decision  # the one that this step follows
     x: Float[Array, " N"]  # m travelled since then
@@ -152,7 +154,10 @@ def decide(
     lights = switch(config, lane_map, state, rows.lane, rows.line)
     yielding = give_way(lane_map, state, rows, own, lights)
     state = replace(state, lights=lights, held=yielding.held, stopped=yielding.stopped)
-    wall = jnp.minimum(_lane_end(lane_map, state, ahead), yielding.stop + state.driver.s0)
+    end = _lane_end(lane_map, state, ahead)
+    # as far back as it can still stop for gently
+    end = jnp.maximum(end - choice.stops_before, jnp.minimum(end, state.v * state.v / (2 * _GENTLY)))
+    wall = jnp.minimum(end, yielding.stop + state.driver.s0)
     obstacles = Obstacles(
         jnp.stack([own.lead, second.lead, yielding.lead, jnp.full_like(own.lead, -1)], -1),
         jnp.stack([own.lead_gap, second.lead_gap, yielding.lead_gap, wall], -1),
@@ -211,7 +216,8 @@ def _behind_tails(lane_map: LaneMap, state: State, own: Pair) -> Pair:
 
 def _stay(state: State) -> LaneChoice:
     stay = jnp.zeros_like(state.side)
-    return LaneChoice(side=stay, letting=stay - 1, letting_gap=jnp.zeros_like(state.v))
+    none = jnp.zeros_like(state.v)
+    return LaneChoice(side=stay, letting=stay - 1, letting_gap=none, stops_before=none)
 
 
 def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N"]:
@@ -302,16 +308,16 @@ def drive(
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], Any]:
         state, x = carry
         state = replace(state, **fixed)
-        state, dx, left = _step(config, traffic, lane_map, state, decision, x, command, free)
+        state, dx, left, off = _step(config, traffic, lane_map, state, decision, x, command, free)
         x = x + dx
-        tick = Tick(state, left, config.time(state.step), decision, x, dx, command)
+        tick = Tick(state, left, off, config.time(state.step), decision, x, dx, command)
         return (bare(state), x), None if record is None else record(tick)
 
     before, x = state, mapped_like(state.s, jnp.zeros_like(state.s))
     (state, _), records = lax.scan(step, (bare(state), x), None, length=config.decision_every)
     state = replace(state, **fixed)
     if traffic.look_for_contacts == "decision":
-        state = record_events(config, lane_map, state)
+        state, _ = record_events(config, lane_map, state, free=free)
     if state.egos.slot.shape[0]:
         state = sync(lane_map, state, boxes(lane_map, state))
     return _ran_red(lane_map, state, before), records
@@ -326,8 +332,8 @@ def _step(
     x: Float[Array, " N"],
     command: Command,
     may_be_free: bool,
-) -> tuple[State, Float[Array, " N"], Bool[Array, " N"]]:
-    """One physics step, `x` m after the decision: the state, the metres travelled, who has left."""
+) -> tuple[State, Float[Array, " N"], Bool[Array, " N"], Bool[Array, " N"] | None]:
+    """One physics step, `x` m after the decision: the state, metres travelled, who has left, who is off."""
     egos = state.egos
     a = accelerations(traffic.model, state, decision, x)
     if command.meta is not None:
@@ -358,9 +364,10 @@ def _step(
         left &= ~is_free(state)
         moved = with_free(moved, free)
     state = replace(moved, step=state.step + 1)
+    off = None
     if traffic.look_for_contacts == "step":
-        state = record_events(config, lane_map, state)
-    return state, dx, left
+        state, off = record_events(config, lane_map, state, free=may_be_free)
+    return state, dx, left, off
 
 
 def _ran_red(lane_map: LaneMap, state: State, before: State) -> State:

@@ -32,6 +32,15 @@ CAUTION = 40.0
 COURTEOUS = 0.6
 """Urgency from which the follower on the other lane lets a vehicle in."""
 
+INTENT = 0.3
+"""Urgency from which a driver looks only where the route goes, and minds who needs the own lane."""
+
+SOON = 2.0
+"""s ahead, at which it counts who of two vehicles is behind."""
+
+BEHIND = 2.5
+"""m left to the rear of a vehicle that changes to the own lane from a standstill."""
+
 REST = 4.0
 """s from the end of a lane change to the start of the next voluntary one."""
 
@@ -51,6 +60,7 @@ class LaneChoice(NamedTuple):
     side: Int[Array, " N"]  # +1 left, -1 right, 0 stay
     letting: Int[Array, " N"]  # slot of the vehicle that each one should let in, -1 for none
     letting_gap: Float[Array, " N"]  # m to it
+    stops_before: Float[Array, " N"]  # m before the end of a wrong lane, to let another one out of its lane
 
 
 def urgency(
@@ -98,7 +108,7 @@ def side_to_look(lane_map: LaneMap, state: State, turn: Int[Array, ""]) -> Int[A
     """
     press = _pressing(lane_map, state)
     to_go = lane_map.routes.lanes_to_go[state.lane, state.goal]
-    return jnp.where(press > COURTEOUS, jnp.sign(to_go), turn)
+    return jnp.where(press > INTENT, jnp.sign(to_go), turn)
 
 
 def _pressing(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
@@ -223,10 +233,21 @@ def choose_lane(
     letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(asks, pair.lag, n)].max(me)[:n]
     letting_gap = jnp.where(letting >= 0, pair.lag_gap[letting], NO_GAP)
     letting = jnp.where(letting_gap > 0, letting, -1)
+
+    # of two abreast that need each other's lanes the one that will be behind stops behind the other: else
+    # both wait at the ends of their lanes for good
+    lead = (pair.lead >= 0) & (pair.lead_gap < ROOM)
+    abreast = jnp.where(lead, pair.lead, jnp.where(pair.lag_gap < ROOM, pair.lag, -1))
+    ahead = jnp.where(lead, pair.lead_gap + shape.length[pair.lead], -pair.lag_gap - shape.length)
+    ahead += SOON * (state.v[abreast] - state.v)
+    behind = (ahead > 0) | ((ahead == 0) & (me > abreast))
+    swaps = towards & (press > INTENT) & (abreast >= 0) & behind
+    swaps &= (wanted[abreast] == -wanted) & (press[abreast] > 0)
     return LaneChoice(
         side=jnp.where(starts, side, 0),
         letting=letting,
         letting_gap=letting_gap,
+        stops_before=jnp.where(swaps, shape.length[abreast] + BEHIND, 0),
     )
 
 

@@ -11,12 +11,14 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, neighbor
+from limsim_jax.policies.base import Policy
 from limsim_jax.policies.limsim_tm.decide import Told, grouped, neighbours, tell
 from limsim_jax.policies.limsim_tm.plan import Lattice, Merge, Others, Task, plan, room_needed
 from limsim_jax.policies.limsim_tm.search import Settings, no_plan, shifted
 from limsim_jax.policies.perception import Around, around, rules
-from limsim_jax.policies.predict import Prediction, constant_velocity
+from limsim_jax.policies.predict import Prediction, Predictor, constant_velocity
 from limsim_jax.policies.reference import Way, beside, body_lane, motion_on, way_ahead
+from limsim_jax.policies.simple import FollowLane
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.ego import Trajectory, at_slots
 from limsim_jax.traffic.engine import Command, Decision, Traffic
@@ -44,6 +46,7 @@ class LimSimTM:
       search: for manoeuvres; None: lane changes by MOBIL.
       search_every: decisions from one search to the next.
       obedience: desired speed of the egos, as a share of the speed limit at most.
+      predict: where the others will be.
       lattice: of trajectories.
       traffic: rules of the road, and how drivers follow each other.
     """
@@ -53,10 +56,19 @@ class LimSimTM:
     search: Settings | None = field(default_factory=lambda: Settings(simulations=40, change=0.08))
     search_every: int = 3
     obedience: float = 0.985
+    predict: Predictor = constant_velocity
     lattice: Lattice = field(default_factory=Lattice)
     traffic: Traffic = field(default_factory=Traffic)
 
     free = True
+
+    def variants(self, seen: Predictor) -> dict[str, Policy]:
+        """With a reference in the place of a module: what came to pass, MOBIL, car following on its lane."""
+        return {
+            "prediction": replace(self, predict=seen),
+            "decision": replace(self, search=None),
+            "planning": FollowLane(others=self.others, traffic=self.traffic),
+        }
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Memory:
         """No lane change under way, nothing searched."""
@@ -84,7 +96,7 @@ class LimSimTM:
         d, goal = state.d[slot], state.goal[slot]
 
         wall = decision.obstacles.gap[:, -1] - state.driver.s0
-        prediction = constant_velocity(lane_map, state, self.lattice.times(), stop=wall)
+        prediction = self.predict(lane_map, state, self.lattice.times(), stop=wall)
         own = way_ahead(lane_map, lane, s, goal, points=_POINTS, step=_STEP)
         nearby = around(state, prediction, own, slot, self.nearest)
 
@@ -156,7 +168,7 @@ class LimSimTM:
 
         def look(carry: tuple[Array, Told]) -> tuple[Array, Told]:
             times = settings.dt * jnp.arange(settings.steps + 1, dtype=jnp.float32)
-            prediction = constant_velocity(lane_map, state, times, stop=wall)
+            prediction = self.predict(lane_map, state, times, stop=wall)
             counts = neighbours(nearby.gap, nearby.d, nearby.there)
             members = grouped(
                 lane_map, state, slot, drives, lane, jnp.where(side != 0, side, wish),
