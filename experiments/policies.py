@@ -5,6 +5,7 @@
 Worlds go to results/policies: what was killed goes on where it was, and `limsim-jax report results/policies`
 shows the worst of them. Writes experiments/results/policies.json and .md; policies and scenarios that are not
 named keep their rows. `--paper 10` adds what the first ten seeds alone give, as many as the paper has.
+Decisions are timed by `limsim-jax bench policy`, on a quiet machine; `--skip decisions` leaves that for later.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ POLICIES = ("like_traffic", "pdm_closed", "pdm_hybrid", "limsim_tm")
 MEANS = {"completion": "completion", "score": "limsim_faithful_drive", "nuplan": "nuplan_score"}
 
 
-def measure(policy: str, scenario: str, seeds: int, few: int, out: Path) -> dict[str, Any]:
+def worlds(policy: str, scenario: str, seeds: int, few: int, out: Path) -> dict[str, Any]:
     """One cell of the table."""
     (experiment,) = read_experiments(scenario, policy=policy)
     episodes = Episodes(experiment)
@@ -41,19 +42,24 @@ def measure(policy: str, scenario: str, seeds: int, few: int, out: Path) -> dict
         print(f"{scenario} / {policy}: {now.done} of {now.wanted} worlds, {now.elapsed:.0f} s", flush=True)
 
     sweep([episodes], range(seeds), out, progress=show)
-    worlds = open_results(out).episodes
+    rows = open_results(out).episodes
     mine = (pc.field("scenario") == scenario) & (pc.field("policy") == policy) & (pc.field("seed") < seeds)
     found = {
         name: np.asarray(column)
-        for name, column in worlds.filter(mine).sort_by("seed").to_pydict().items()
+        for name, column in rows.filter(mine).sort_by("seed").to_pydict().items()
         if name in {"success", "at_fault_contacts", "contacts", "traffic_collided", *MEANS.values()}
     }
     row: dict[str, Any] = {"policy": policy, "scenario": scenario, "seeds": seeds}
     row |= summary(found) | {"background_collisions": int(found["traffic_collided"].sum())}
     if few:
         row["few"] = {"seeds": few} | summary({name: values[:few] for name, values in found.items()})
+    return row
+
+
+def decisions(policy: str, scenario: str) -> dict[str, Any]:
+    """How long they take."""
     told = bench_policy(scenario, policy, cold=True)
-    return row | {
+    return {
         "decision_ms": 1e3 * told["latency_s"],
         "amortised_ms": 1e3 * told["amortised_s"],
         "compile_s": told["amortised_compile_s"],
@@ -81,6 +87,7 @@ def main() -> None:
     parser.add_argument("--paper", type=int, default=10)
     parser.add_argument("--policies", nargs="+", default=list(POLICIES))
     parser.add_argument("--scenarios", nargs="+", default=list(PAPER))
+    parser.add_argument("--skip", choices=("worlds", "decisions"))
     parser.add_argument("--out", type=Path, default=Path("results/policies"))
     options = parser.parse_args()
     use_all_cores()
@@ -91,8 +98,12 @@ def main() -> None:
     for policy in options.policies:
         for scenario in options.scenarios:
             few = min(options.paper, options.seeds)
-            kept[scenario, policy] = measure(policy, scenario, options.seeds, few, options.out)
-            print(json.dumps(kept[scenario, policy]), flush=True)
+            row = kept.setdefault((scenario, policy), {})
+            if options.skip != "worlds":
+                row |= worlds(policy, scenario, options.seeds, few, options.out)
+            if options.skip != "decisions":
+                row |= decisions(policy, scenario)
+            print(json.dumps(row), flush=True)
             rows = [kept[s, p] for s in PAPER for p in POLICIES if (s, p) in kept]
             write_whole(file, json.dumps({"rows": rows}, indent=1) + "\n")
             head = "Regenerate: `python experiments/policies.py`\n\n"

@@ -207,10 +207,11 @@ def policies(result: dict[str, Any]) -> str:
         (success, low, high), (score, least, most) = ([100 * x for x in r["success"]], r["score"])
         fault, _, bound = (100 * x for x in r["at_fault_contacts"])
         theirs = f" ({PAPER[r['scenario']]})" if r["policy"] == "limsim_tm" else ""
+        amortised = f"{r['amortised_ms']:.2f}" if "amortised_ms" in r else "not measured"
         rows.append(
             f"| {r['scenario']} | {r['policy']} | {r['seeds']:,} | {success:.1f} [{low:.1f}, {high:.1f}] "
             f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}]{theirs} "
-            f"| {fault:.1f} (at most {bound:.1f}) | {r['decision_ms']:.1f} | {r['amortised_ms']:.2f} |"
+            f"| {fault:.1f} (at most {bound:.1f}) | {r['decision_ms']:.1f} | {amortised} |"
         )
     return "\n".join(rows)
 

@@ -111,6 +111,7 @@ def test_each_module_has_a_reference():
     assert found["decision"] == replace(policy, search=None)
     assert found["planning"] == FollowLane(others=2)
     mine = variants(AreaOfInterest(around=policy, slots=2), straight)["decision"]
+    assert isinstance(mine, AreaOfInterest) and isinstance(mine.around, LimSimTM)
     assert mine.ego == LimSimTM(search=None, search_every=2) and mine.around.search is not None
     assert list(variants(PDMClosed(), straight)) == ["prediction", "planning"]
     assert variants(LikeTraffic(), straight) == {}
