@@ -5,7 +5,7 @@
 Worlds go to results/policies: what was killed goes on where it was, and `limsim-jax report results/policies`
 shows the worst of them. Writes experiments/results/policies.json and .md; policies and scenarios that are not
 named keep their rows. `--paper 10` adds what the first ten seeds alone give, as many as the paper has.
-Decisions are timed by `limsim-jax bench policy`, on a quiet machine; `--skip decisions` leaves that for later.
+Decisions are timed by `limsim-jax bench policy`; `--skip decisions` leaves that for a quiet machine.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 Axis = int | Sequence[int] | None
 Tree = TypeVar("Tree")
@@ -29,6 +29,16 @@ def computed_once(tree: Tree) -> Tree:
     """
     with set_xla_metadata(inlineable="false"):
         return _kept_apart(tree)
+
+
+def interval(place: Float[Array, "*b"], count: int) -> tuple[Int[Array, "*b"], Float[Array, "*b"]]:
+    """In which of `count` intervals of length 1 a place is, and where there; outside of all, of the nearest.
+
+    The number is worked out once: XLA may round the place otherwise where it works it out again, and a
+    number and a fraction that do not belong together are off by a whole interval.
+    """
+    k = computed_once(jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 1))
+    return k, place - k.astype(place.dtype)
 
 
 def mapped_like(x: Array, tree: Tree) -> Tree:

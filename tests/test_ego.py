@@ -7,13 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from traffic_worlds import bundled, state_of
+from traffic_worlds import bundled, no_arrivals, state_of
 
 from limsim_jax.maps.lane_map import NO_LANE, pose, to_frenet, width
+from limsim_jax.policies.simple import FollowLane
+from limsim_jax.rollout import Rollout, trace
 from limsim_jax.traffic import ego
 from limsim_jax.traffic.ego import Control, Limits, Meta, Trajectory
+from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import advance, boxes
-from limsim_jax.types import Config, State
+from limsim_jax.types import Config, Scenario, State
 
 CONFIG = Config(dt=0.1)
 N, STEPS = 8, 120
@@ -681,3 +684,26 @@ def test_meta_actions():
     np.testing.assert_allclose(
         ego.meta_acceleration(meta, state, follow), np.minimum(wish, [1, 1, 1, 1, 1, 1, 0.6, -3])
     )
+
+
+def test_optimised_code_follows_a_trajectory_smoothly_too():
+    """Other tests compile without optimisation; with it, numbers are rounded otherwise from use to use."""
+    lane_map = bundled("ramp")[1]
+    goals = np.asarray(lane_map.routes.reachable)
+    lanes = np.nonzero(np.asarray(lane_map.length) > 300)[0][:4]
+    states = [
+        state_of("ramp", [lane], [20.0 + lane], [15.0 + 0.7 * k], [int(np.nonzero(goals[lane])[0][0])])
+        for k, lane in enumerate(lanes)
+    ]
+    start = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    run = Rollout(Config(dt=0.1), Traffic(lane_changes=False), 4.0, FollowLane(), record=trace)
+
+    def speeding_up(lane_map, state):
+        egos = ego.from_lane(lane_map, state, boxes(lane_map, state), [0], free=True)
+        state = dataclasses.replace(state, egos=egos)
+        scenario = Scenario(start=state, schedule=no_arrivals(state))
+        return run(lane_map, scenario, jax.random.key(0)).trace.a[5:, 0]  # after the start
+
+    options = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False}
+    a = jax.jit(jax.vmap(speeding_up, (None, 0)), compiler_options=options)(lane_map, start)
+    assert np.abs(np.diff(np.asarray(a), axis=1)).max() < 0.3  # m/s^2 from step to step

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from conftest import REPO
 from fake_episodes import FakeEpisodes, both
+from real_episodes import noted
 
 ray = pytest.importorskip("ray", reason="needs the extra 'ray'")
 
@@ -70,6 +71,25 @@ def test_a_worker_that_is_killed_midway_loses_nothing(tmp_path):
     assert killed and os.getpid() not in processes
     assert processes[-1] != killed[0] and len(set(processes)) >= 3, "nobody took the place of the dead"
     assert 60 <= len(began) <= 61, "only the chunk of the dead worker ran again, if it had begun"
+
+
+@pytest.mark.slow  # every worker compiles
+def test_real_worlds_on_ray_end_as_they_do_here(tmp_path):
+    note = tmp_path / "note"
+    killed = []
+
+    def progress(now: Progress) -> None:
+        if now.done >= 4 and not killed:
+            killed.append(jobs(note)[-1][0])
+            os.kill(killed[0], signal.SIGKILL)
+
+    factory = functools.partial(noted, note)
+    (part,) = sweep_on_ray(factory, range(24), tmp_path / "out", workers=2, progress=progress).parts
+    assert (part.done, part.ran) == (24, 24) and killed
+    sweep(noted(tmp_path / "here"), range(24), tmp_path / "whole")
+    there, here = (open_results(tmp_path / name) for name in ("out", "whole"))
+    assert there.digest == here.digest and there.episodes.equals(here.episodes)
+    assert len({process for process, _ in jobs(note)}) >= 2
 
 
 def test_a_sweep_on_ray_goes_on_where_one_here_stopped(tmp_path):

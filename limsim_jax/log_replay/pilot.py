@@ -15,6 +15,7 @@ from limsim_jax.geometry import wrap_angle
 from limsim_jax.log_replay.scene import Scene
 from limsim_jax.log_replay.takeover import Ego, Flight, Moment
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, to_frenet
+from limsim_jax.numerics import interval
 from limsim_jax.policies.base import Policy
 from limsim_jax.traffic.demand import start_state
 from limsim_jax.traffic.ego import Control, Limits, Trajectory, step_free, track
@@ -187,8 +188,8 @@ def _sampled(trajectory: Trajectory, time: Float[Array, " H"]) -> Array:
     """x, y, heading of the trajectory of the only ego; beyond its end at the last speed."""
     last = trajectory.x.shape[-1] - 1
     at = (time - trajectory.t0) / trajectory.dt
-    k = jnp.clip(jnp.floor(at).astype(jnp.int32), 0, last - 1)
-    u = jnp.clip(at - k.astype(at.dtype), 0, 1)
+    k, u = interval(at, last)
+    u = jnp.clip(u, 0, 1)
     beyond = jnp.maximum(at - last, 0) * trajectory.dt
     values = [jnp.unwrap(z) if name == "heading" else z for name, z in _rows(trajectory)]
     x, y, heading, v = (z[k] + u * (z[k + 1] - z[k]) for z in values)

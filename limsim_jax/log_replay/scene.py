@@ -22,6 +22,7 @@ from scipy.spatial import KDTree
 from limsim_jax.log_replay.recorded import Recorded
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, lane_ids, project, relative
 from limsim_jax.maps.network import Network
+from limsim_jax.numerics import interval
 from limsim_jax.types import Driver
 
 GRID = 1.0
@@ -220,9 +221,8 @@ def separation(length: Any, width: Any, dx: Any, dy: Any, angle: tuple[Any, Any]
 
 
 def _cell(scene: Scene, p: Array) -> tuple[Array, Array]:
-    place = jnp.clip(p / GRID, 0, scene.path.shape[1] - 1.001)
-    k = jnp.floor(place)
-    return k.astype(jnp.int32), place - k
+    last = scene.path.shape[1] - 1
+    return interval(jnp.clip(p / GRID, 0, last - 0.001), last)
 
 
 # --- on the host -------------------------------------------------------------------------------------

@@ -162,7 +162,8 @@ class Recalled:
         last = self.box.shape[0] - 1
         now = state.step - 1  # the first row is after the first step
         then = jnp.clip(now + jnp.round(times / self.dt).astype(jnp.int32), 0, last)
-        moved = jnp.moveaxis(self.box[then, :, :3] - self.box[jnp.clip(now, 0, last), :, :3], 0, 1)  # [N H 3]
+        moved = self.box[then, :, :3] - self.box[jnp.clip(now, 0, last), :, :3][None]
+        moved = jnp.moveaxis(moved, 0, 1)  # [N, H, 3]
         x, y, heading = (boxes(lane_map, state)[:, k, None] + moved[..., k] for k in range(3))
         shape = state.shape
         prediction = Prediction(

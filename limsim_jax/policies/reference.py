@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, neighbor, pose, side_s, width
+from limsim_jax.numerics import interval
 from limsim_jax.traffic.ego import body_place
 from limsim_jax.traffic.motion import lateral_speed
 from limsim_jax.types import State
@@ -190,10 +191,7 @@ def place_on(way: Way, s: Float[Array, "V ..."], d: Float[Array, "V ..."]) -> Pl
     """
     flat = (s.shape[0], -1)
     s_, d_ = s.reshape(flat), jnp.broadcast_to(d, s.shape).reshape(flat)
-    last = way.x.shape[-1] - 2
-    u = s_ / way.step
-    k = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, last)
-    u = u - k.astype(u.dtype)
+    k, u = interval(s_ / way.step, way.x.shape[-1] - 1)
     inside = jnp.clip(u, 0, 1)
     rest = (u - inside) * way.step
 

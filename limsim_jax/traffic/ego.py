@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from limsim_jax.geometry import direction, wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, pose, project, side_s, to_frenet, width
-from limsim_jax.numerics import safe_divide, safe_norm
+from limsim_jax.numerics import interval, safe_divide, safe_norm
 from limsim_jax.traffic.car_following import ballistic
 from limsim_jax.types import Config, Egos, State
 
@@ -497,8 +497,8 @@ def _sample(trajectory: Trajectory, time: Float[Array, " E"]) -> _Sample:
     chords = safe_norm(steps)
     way = jnp.cumsum(chords, -1)
     place = (time - trajectory.t0) / dt
-    k = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 2)
-    u = jnp.clip(place - k.astype(place.dtype), 0, 1)
+    k, u = interval(place, count - 1)
+    u = jnp.clip(u, 0, 1)
     x0, y0, v0, v1, h0, h1 = (
         _take(values, k + n)
         for values, n in (

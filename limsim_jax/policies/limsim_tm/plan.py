@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from limsim_jax.numerics import interval
 from limsim_jax.policies.reference import Frenet, Way, place_on
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
 from limsim_jax.types import Driver
@@ -354,12 +355,11 @@ def _costs(
     way, driver, t = task.way, task.driver, lattice.times()[None, None]
     each = lambda value: value[:, None, None]  # noqa: E731
     flat = (s.shape[0], -1)
-    u = s.reshape(flat) / way.step
-    k = jnp.clip(u.astype(jnp.int32), 0, way.x.shape[-1] - 2)
+    k, u = interval(s.reshape(flat) / way.step, way.x.shape[-1] - 1)
 
     def along(table: Float[Array, "V M"]) -> Array:
         low, high = jnp.take_along_axis(table, k, 1), jnp.take_along_axis(table, k + 1, 1)
-        return (low + jnp.clip(u - k.astype(u.dtype), 0, 1) * (high - low)).reshape(s.shape)
+        return (low + jnp.clip(u, 0, 1) * (high - low)).reshape(s.shape)
 
     allowed = along(envelope)
     # against one speed for all samples: who gets to where more is allowed must not look slower for it

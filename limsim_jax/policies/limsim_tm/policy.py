@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, neighbor
+from limsim_jax.numerics import interval
 from limsim_jax.policies.base import Policy
 from limsim_jax.policies.limsim_tm.decide import Told, grouped, neighbours, tell
 from limsim_jax.policies.limsim_tm.plan import Lattice, Merge, Others, Task, plan, room_needed
@@ -211,9 +212,9 @@ class LimSimTM:
         if self.search is None:
             return jnp.full((late.shape[0], self.lattice.moments), _ANY_SPEED)
         at = (late[:, None] + self.lattice.times()[None]) / self.search.dt
-        k = jnp.clip(at.astype(jnp.int32), 0, told.v.shape[1] - 2)
+        k, u = interval(at, told.v.shape[1] - 1)
         low, high = jnp.take_along_axis(told.v, k, 1), jnp.take_along_axis(told.v, k + 1, 1)
-        v = low + jnp.clip(at - k.astype(at.dtype), 0, 1) * (high - low)
+        v = low + jnp.clip(u, 0, 1) * (high - low)
         return jnp.where(late[:, None] < 1e2, v, _ANY_SPEED)
 
     def _fits(
