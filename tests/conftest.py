@@ -40,3 +40,12 @@ SHARED = Path(os.environ.get("LIMSIM_SHARED_DATA", REPO.parent / "shared" / "dat
 needs_shared = pytest.mark.skipif(
     not SHARED.is_dir(), reason=f"no shared data at {SHARED}; set LIMSIM_SHARED_DATA to their folder"
 )
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room_for_programs():
+    """Every compiled kernel takes memory maps, of which Linux lets a process have 65,530: XLA crashes there."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_text().splitlines()) > 20_000:
+        jax.clear_caches()
