@@ -44,7 +44,7 @@ needs_shared = pytest.mark.skipif(
 
 @pytest.fixture(autouse=True, scope="module")
 def room_for_programs():
-    """Every compiled kernel takes memory maps, of which Linux lets a process have 65,530: XLA crashes there."""
+    """Compiled kernels take memory maps, of which Linux lets a process have 65,530: XLA crashes there."""
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and len(maps.read_text().splitlines()) > 20_000:
