@@ -98,6 +98,8 @@ def main() -> None:
     for policy in options.policies:
         for scenario in options.scenarios:
             few = min(options.paper, options.seeds)
+            if options.skip == "worlds" and (scenario, policy) not in kept:
+                parser.error(f"--skip worlds: none of {scenario} with {policy} have been run yet")
             row = kept.setdefault((scenario, policy), {})
             if options.skip != "worlds":
                 row |= worlds(policy, scenario, options.seeds, few, options.out)

@@ -492,9 +492,9 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
     import numpy as np
-    from jax.sharding import Mesh, PartitionSpec
+    from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-    from limsim_jax.rollout import enable_compilation_cache, run_once, started, use_all_cores
+    from limsim_jax.rollout import enable_compilation_cache, over_worlds, run_once, started, use_all_cores
     from limsim_jax.sweep.episode import Episodes
     from limsim_jax.sweep.experiment import read_experiments
 
@@ -506,31 +506,25 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
     run, lane_map = episodes.rollout, episodes.lane_map
     devices = jax.local_devices()[: options["worlds"]]
     worlds = -(-options["worlds"] // len(devices)) * len(devices)
-    mesh, axis = Mesh(np.array(devices), ("worlds",)), PartitionSpec("worlds")
-
-    def over_worlds(one: Callable[..., Any], count: int) -> Callable[..., Any]:
-        many = jax.vmap(one, in_axes=(None, *[0] * count))
-        specs = (PartitionSpec(), *[axis] * count)
-        return jax.shard_map(many, mesh=mesh, in_specs=specs, out_specs=axis, check_vma=False)
+    mesh = Mesh(np.array(devices), ("worlds",))
+    lane_map = jax.device_put(lane_map, NamedSharding(mesh, PartitionSpec()))
 
     def begin(lane_map: Any, seed: Any) -> Any:
         world = started(run, lane_map, episodes.sample, seed)
         return world.carry.state, world.carry.memory, world.key
 
-    def decide(lane_map: Any, state: Any, memory: Any, key: Any) -> Any:
-        return run.policy(run.config, lane_map, state, memory, key)
+    def decide(lane_map: Any, world: Any) -> Any:
+        return run.policy(run.config, lane_map, *world)
 
-    seeds = jnp.arange(worlds, dtype=jnp.int32)
-    begun = jax.jit(over_worlds(begin, 1), compiler_options=run_once())(lane_map, seeds)
+    begun = over_worlds(begin, mesh, run_once())(lane_map, jnp.arange(worlds, dtype=jnp.int32))
     jax.block_until_ready(begun)
     start = time.perf_counter()
-    made = jax.jit(over_worlds(decide, 3))
-    compiled = made.lower(lane_map, *begun).compile()
+    compiled = over_worlds(decide, mesh).lower(lane_map, begun).compile()
     compile_s = time.perf_counter() - start
     runs = []
     for _ in range(10 * options["repeats"] + 1):
         start = time.perf_counter()
-        jax.block_until_ready(compiled(lane_map, *begun))
+        jax.block_until_ready(compiled(lane_map, begun))
         runs.append(time.perf_counter() - start)
     device = jax.devices()[0]
     return {

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from limsim_jax.files import write_whole
@@ -375,6 +375,22 @@ def run_once() -> dict[str, Any] | None:
     return {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 
+def over_worlds(
+    one: Callable[[LaneMap, Any], Any], mesh: Mesh, compiler_options: dict[str, Any] | None = None
+) -> Any:
+    """A function of the map and one world, jitted for the map and `[B, ...]` worlds shared among devices."""
+    everywhere, worlds = PartitionSpec(), PartitionSpec("worlds")
+    many = jax.shard_map(
+        jax.vmap(one, in_axes=(None, 0)),
+        mesh=mesh,
+        in_specs=(everywhere, worlds),
+        out_specs=worlds,
+        check_vma=False,
+    )
+    here, there = (NamedSharding(mesh, spec) for spec in (everywhere, worlds))
+    return jax.jit(many, in_shardings=(here, there), out_shardings=there, compiler_options=compiler_options)
+
+
 class Worlds:
     """Many worlds of one shape: compiled once, run in chunks over all local devices.
 
@@ -400,20 +416,7 @@ class Worlds:
             raise ValueError(f"a chunk of {chunk} worlds? at least 1")
         self.chunk = -(-chunk // len(devices)) * len(devices)
         self.mesh = Mesh(np.array(devices), ("worlds",))
-        self.lane_map = jax.device_put(lane_map, jax.sharding.NamedSharding(self.mesh, PartitionSpec()))
-
-        everywhere, worlds = PartitionSpec(), PartitionSpec("worlds")
-        shardings = tuple(jax.sharding.NamedSharding(self.mesh, spec) for spec in (everywhere, worlds))
-
-        def over_worlds(one: Callable[[LaneMap, Any], Any], options: dict[str, Any] | None = None) -> Any:
-            many = jax.shard_map(
-                jax.vmap(one, in_axes=(None, 0)),
-                mesh=self.mesh,
-                in_specs=(everywhere, worlds),
-                out_specs=worlds,
-                check_vma=False,
-            )
-            return jax.jit(many, in_shardings=shardings, out_shardings=shardings[1], compiler_options=options)
+        self.lane_map = jax.device_put(lane_map, NamedSharding(self.mesh, PartitionSpec()))
 
         def start(lane_map: LaneMap, seed: Int[Array, ""]) -> Started:
             return started(run, lane_map, sampler, seed)
@@ -421,7 +424,8 @@ class Worlds:
         def go_on(lane_map: LaneMap, world: Started) -> Result:
             return run.go_on(lane_map, *world)[0]
 
-        self._start, self._go_on = over_worlds(start, run_once()), over_worlds(go_on)
+        self._start: Any = over_worlds(start, self.mesh, run_once())
+        self._go_on: Any = over_worlds(go_on, self.mesh)
 
     def compile(self) -> Worlds:
         """Compile now; else the first chunk does."""

@@ -68,19 +68,16 @@ class AreaOfInterest:
         around = _named(self.around, self.options)
         if not around.free:
             raise ValueError("around: a policy that keeps to lanes; it needs one that moves in the plane")
-        if is_dataclass(around) and any(f.name == "others" for f in fields(around)):
-            around = replace(around, others=self.slots)  # the last rows are not egos
-        object.__setattr__(self, "around", around)
+        object.__setattr__(self, "around", _with_others(around, self.slots))  # the last rows are not egos
         if self.ego is not None:
             object.__setattr__(self, "ego", _named(self.ego, {}))
             object.__setattr__(self, "free", self.ego.free)  # pyright: ignore[reportAttributeAccessIssue]
 
     def variants(self, seen: Predictor) -> dict[str, Policy]:
         """With a reference in the place of a module of the egos' planner; who is around keeps its own."""
-        policy = self.around if self.ego is None else self.ego
-        if is_dataclass(policy) and any(f.name == "others" for f in fields(policy)):
-            policy = replace(policy, others=0)
-        return {name: replace(self, ego=other) for name, other in variants(policy, seen).items()}
+        policy = _named(self.around if self.ego is None else self.ego, {})
+        found = variants(_with_others(policy, 0), seen)
+        return {name: replace(self, ego=other) for name, other in found.items()}
 
     @property
     def others(self) -> int:
@@ -195,6 +192,13 @@ def _named(policy: Policy | str, options: dict[str, Any]) -> Policy:
         known = ", ".join(name for name in POLICIES if name != "area_of_interest")
         raise ValueError(f"unknown policy '{policy}'; known are {known}")
     return POLICIES[policy](**options)
+
+
+def _with_others(policy: Policy, count: int) -> Policy:
+    """The policy for so many vehicles beside the egos, if it can drive any."""
+    if is_dataclass(policy) and any(f.name == "others" for f in fields(policy)):
+        return replace(policy, others=count)
+    return policy
 
 
 def _rows_where(fresh: Bool[Array, " E"], new: Array, old: Array) -> Array:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.rollout import Carry, Rollout, enable_compilation_cache, run_once, started
+from limsim_jax.rollout import Carry, Rollout, Started, enable_compilation_cache, run_once, started
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.types import Schedule
 
@@ -53,8 +53,11 @@ def stopped(episodes: Episodes, seed: int, times: Sequence[float]) -> Stopped:
         )
     enable_compilation_cache()
     bare = replace(run, measure=None, record=None)
-    first = jax.jit(lambda seed: started(bare, lane_map, episodes.sample, seed), compiler_options=run_once())
-    schedule, key, begun = first(seed)
+
+    def start(lane_map: LaneMap, seed: int) -> Started:
+        return started(bare, lane_map, episodes.sample, seed)
+
+    schedule, key, begun = jax.jit(start, compiler_options=run_once())(lane_map, seed)
 
     @jax.jit
     def decide(lane_map: LaneMap, schedule: Schedule, carry: Carry) -> Carry:
