@@ -171,6 +171,18 @@ def test_the_tracker_stays_on_a_circle():
     np.testing.assert_allclose(motion.steering[..., -1], np.repeat(ackermann[:, None], P, 1), rtol=0.05)
 
 
+def test_the_bicycle_drives_a_circle():
+    """Who is on it with the right steering stays on it; nuPlan's Euler steps drift outwards."""
+    me = body((20.0, 20.0), d=(0.0, 0.0))
+    me = me._replace(steering=jnp.arctan(me.wheelbase / 300.0))
+    off = []
+    for strict in (False, True):
+        motion = pdm.drive_along(arc(20.0, 300.0), me, 80, strict)
+        off.append((np.hypot(motion.x, np.asarray(motion.y) - 300.0) - 300.0)[0, 0])
+    assert np.abs(off[0]).max() < 0.005
+    assert off[1].max() > 0.05
+
+
 def test_fitted_profiles_are_those_of_a_smooth_path():
     t = 0.1 * np.arange(41)
     v = 5 + 0.8 * t
@@ -456,6 +468,29 @@ def test_conventions_of_the_public_implementation():
     assert 0.05 < apart[10] < 0.6
     x, y = (np.asarray(getattr(ours.trajectory, k) - getattr(theirs.trajectory, k)) for k in "xy")
     assert np.hypot(x, y).max() < 2.0
+
+
+def test_who_changes_lanes_signals_and_keeps_the_body_on_the_road():
+    """On the entrance lane of the ramp, which ends, and on a lane at the right edge of the road behind it."""
+    lane_map = bundled("ramp")[1]
+    goal = 0
+    to_go, edge = np.asarray(lane_map.routes.lanes_to_go)[:, goal], np.asarray(lane_map.right) < 0
+    beside = edge & (np.asarray(lane_map.left) >= 0) & ~np.asarray(lane_map.is_connector)
+    entrance, straight_on = (int(np.nonzero(beside & (to_go == n))[0][i]) for n, i in ((1, 0), (0, -1)))
+    lanes = [entrance, straight_on]
+    state = world("ramp", lanes, [100.0, 100.0], [20.0, 20.0], [goal, goal], free=(0, 1))
+    assert np.asarray(planned("ramp", state).signal).tolist() == [1, 0]
+    assert np.asarray(planned("ramp", state, strict=True).signal).tolist() == [0, 0]
+    state = dataclasses.replace(state, shape=dataclasses.replace(state.shape, width=state.shape.width + 0.6))
+    half = float(state.shape.width[1]) / 2
+    body, slot = pdm.bodies(state, jnp.arange(2)), jnp.arange(2)
+    ours, theirs = (
+        np.asarray(pdm.road_ahead(lane_map, state, slot, body, strict).offset[1]) for strict in (False, True)
+    )
+    np.testing.assert_allclose(theirs, pdm.OFFSETS)
+    free = 3.75 / 2 - half
+    assert free < 0.9
+    np.testing.assert_allclose(ours, [0, -free, 1], atol=0.01)
 
 
 def test_unused_rows_and_empty_slots_do_no_harm():

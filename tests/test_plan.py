@@ -15,6 +15,7 @@ from limsim_jax.policies.limsim_tm.plan import (
     Merge,
     Others,
     Task,
+    leaders,
     plan,
     quartic,
     quintic,
@@ -66,7 +67,8 @@ def task(
         others = Others(away, away, jnp.zeros(shape), unit, unit, jnp.zeros((count, K), bool))
     return Task(
         way=way(bends, limit), start=start, length=each(4.8), width=each(1.9), driver=drivers(count),
-        lead_gap=each(lead[0])[:, None], lead_v=each(lead[1])[:, None], wall=each(wall), other=others,
+        lead_gap=each(lead[0])[:, None], lead_v=each(lead[1])[:, None],
+        lead_a=each(lead[2] if len(lead) > 2 else 0.0)[:, None], wall=each(wall), other=others,
         merge=Merge(none, none, none, none > 0, zero),
         wanted=jnp.full((count, h), 1e3), steering=each(0.5), wheelbase=each(2.8),
     )  # fmt: skip
@@ -167,6 +169,39 @@ def test_follows_a_slower_leader_without_coming_too_near():
     assert gap.min() > 6.0 and chosen.v[0, -1] < 11.0 and chosen.safe[0]
     stands = planned(task(v=0.0, lead=(2.2, 0.0)))
     assert stands.x[0, -1] < 0.5
+
+
+def test_leaders_go_on_braking_to_a_standstill():
+    case = task(lead=(20.0, 10.0, -2.0))
+    far, v = leaders(case, jnp.array([[0.0, 2.0, 10.0]]))
+    np.testing.assert_allclose(far[0, :, 0], [20.0, 20 + 20 - 4, 20 + 25], rtol=1e-5)
+    np.testing.assert_allclose(v[0, :, 0], [10.0, 6.0, 0.0], atol=1e-5)
+    far, v = leaders(task(lead=(20.0, 10.0, 1.0)), jnp.array([[5.0]]))  # nobody is counted on to speed up
+    assert (float(far[0, 0, 0]), float(v[0, 0, 0])) == (70.0, 10.0)
+
+
+def test_a_leader_that_brakes_hard_is_braked_for():
+    """Where its present speed alone would allow to brake mildly."""
+    mild, hard = (planned(task(v=18.7, lead=(13.0, 12.5, a))) for a in (0.0, -3.9))
+    assert mild.v[0, 5] > 14.5
+    assert hard.v[0, 5] < 11.5
+    stop = 13.0 + 12.5**2 / (2 * 3.9)
+    assert float(hard.x[0].max()) < stop
+
+
+def test_who_needs_a_gap_keeps_its_speed_until_it_has_to_stop():
+    """Braking late and firmly at the end of its lane, against early and mildly at a line."""
+    case = task(v=20.0, limit=25.0, wall=150.0)
+    pressed = case._replace(merge=case.merge._replace(urgency=jnp.full(1, 0.2)))
+    line, lane_end = planned(case), planned(pressed)
+    assert float(lane_end.v[0, 10]) > 19.8 > 19.2 > float(line.v[0, 10])
+    late = sampled(pressed._replace(wall=jnp.full(1, 130.0)))
+    v, s = np.asarray(late.v[0]), np.asarray(late.s[0])
+    firmly = (np.abs(v[:, :13] - 20) < 1e-3).all(1) & (np.abs(v[:, -1] - v[:, -2] + 3.0 * LATTICE.dt) < 1e-3)
+    assert firmly.sum() == len(LATTICE.offsets), "from 2.7 s on"
+    np.testing.assert_allclose(s[firmly, -1] + v[firmly, -1] ** 2 / 6, 130, atol=0.2)
+    room, v = 150.0 - np.asarray(lane_end.x[0]), np.asarray(lane_end.v[0])
+    assert (v * v / (2 * np.maximum(room, 0.1))).max() < 4.5, "and it can still stop"
 
 
 def crossing(arrival):

@@ -83,7 +83,8 @@ def test_inputs_are_in_the_frame_of_the_ego():
 
 
 def test_two_seconds_are_those_of_the_rules_and_the_rest_is_corrected():
-    plan, seen, (trajectory, poses) = foreseen()
+    plan, seen, (command, poses) = foreseen()
+    trajectory = command.trajectory
     for name in ("x", "y", "heading", "v"):
         ours, rules = getattr(trajectory, name)[0], getattr(plan.trajectory, name)[0]
         np.testing.assert_allclose(ours[:21], rules[:21], atol=1e-4)

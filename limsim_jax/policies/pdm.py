@@ -16,13 +16,15 @@ leader at the start    known                                 none: all brake har
 speed                  not below 0                           may fall below 0 for a moment
 standstill gap         1.5 m                                 1 m
 speed limit            where the proposal is by then         of the lane at the start
-path                   led from where the vehicle is         one metre aside at once
+path                   led from where the vehicle is,        one metre aside at once
+                       with all of the body on the road
 required lane change   a path in the lane beside replaces    none: stands at the end of the lane
-                       one of the three, and minds those
-                       behind, too
+                       one of the three, minds those behind,
+                       too, and signals
 lights                 red, and yellow that one can obey     red
 edge of the road       0.3 m as in nuPlan's own metric       to the centimetre
 profiles to track      those of the IDM and of the path      least squares over the poses
+bicycle                moves along its mean heading          moves along its heading before (Euler)
 scores                 equal within 0.001                    exact
 emergency braking      at any speed, 7 m/s^2 along the       up to 5 m/s, poses straight on at a
                        proposal                              corrected speed
@@ -93,6 +95,7 @@ EMERGENCY_TIME, EMERGENCY_SPEED, EMERGENCY_BRAKING = 2.0, 5.0, 7.0
 implementation; m/s^2 of braking in ours."""
 
 _POINTS, _STEP = 121, 2.0  # of the way: 240 m
+_KEEPS = 61  # points of the way on which all of the body keeps to the road: 120 m
 _LANES = 6  # of the way, beyond the first
 _LOOK = 10  # steps that the tracker looks ahead
 _EVERY = 2  # steps between two looks at the others
@@ -208,6 +211,10 @@ def road_ahead(lane_map: LaneMap, state: State, slot: Int[Array, " V"], body: Bo
 
     across = side.astype(d.dtype) * (width(lane_map, lane, front) + width(lane_map, own, state.s[slot])) / 2
     offset = jnp.broadcast_to(jnp.asarray(OFFSETS, d.dtype), (*d.shape, 3))
+    if not strict:
+        room = jnp.stack([way.right, way.left], -1)[:, :_KEEPS] - body.width[:, None, None] / 2
+        right, left = jnp.moveaxis(jnp.maximum(jnp.min(room, 1), 0)[..., None], 1, 0)
+        offset = jnp.clip(offset, -right, left)
     towards = jnp.stack([-across, jnp.sign(across) - across, jnp.zeros_like(across)], -1)
     offset = jnp.where(changes[:, None], towards, offset)
     ends = jnp.where(changes, body.front + within - _CHANGE_ROOM, _FAR)
@@ -562,8 +569,8 @@ def lqr(
 
 
 @jax.named_scope("pdm_track")
-def drive_along(reference: Reference, body: Body, steps: int) -> Motion:
-    """Track all proposals with the LQR and move them by nuPlan's kinematic bicycle (Euler)."""
+def drive_along(reference: Reference, body: Body, steps: int, strict: bool = False) -> Motion:
+    """Track all proposals with the LQR and move them by a kinematic bicycle: nuPlan's (Euler) if strict."""
     shape = reference.x.shape[:2]
 
     def ahead(values: Array) -> Array:
@@ -586,8 +593,9 @@ def drive_along(reference: Reference, body: Body, steps: int) -> Motion:
         wish, rate = lqr(v, steering, lateral, wrap_angle(heading - along), v_ref, list(bends), wheelbase)
         a = a + lag_a * (wish - a)
         turned = lag_steering * rate * DT
-        x, y = x + v * jnp.cos(heading) * DT, y + v * jnp.sin(heading) * DT
-        heading = heading + v * jnp.tan(steering) / wheelbase * DT
+        turn = v * jnp.tan(steering) / wheelbase * DT
+        course = heading if strict else heading + turn / 2
+        x, y, heading = x + v * jnp.cos(course) * DT, y + v * jnp.sin(course) * DT, heading + turn
         v = v + a * DT
         steering = jnp.clip(steering + turned, -_MOST_STEERING, _MOST_STEERING)
         new = x, y, heading, v, a, steering
@@ -909,6 +917,7 @@ class Plan(NamedTuple):
 
     trajectory: Trajectory  # [V T], centre of the body
     best: Int[Array, " V"]  # proposal
+    signal: Int[Array, " V"]  # +1 or -1 if it leads into the lane to the left or right
     brakes: Bool[Array, " V"]  # emergency
     scores: Scores
     tail: Trajectory  # [V T'], the proposal beyond the trajectory
@@ -948,7 +957,8 @@ class PDMClosed:
     ) -> tuple[Command, Any]:
         """The best proposal as a trajectory over 4 s."""
         del key
-        return Command(trajectory=self.plan(config, lane_map, state).trajectory), memory
+        plan = self.plan(config, lane_map, state)
+        return Command(trajectory=plan.trajectory, signal=plan.signal), memory
 
     def plan(self, config: Config, lane_map: LaneMap, state: State, beyond: int = 0) -> Plan:
         """The decision, and the chosen proposal for so many steps of `DT` beyond its trajectory."""
@@ -962,13 +972,15 @@ class PDMClosed:
         along = computed_once(_along(road, body, others, steps))
         proposals = computed_once(idm(road, body, along, strict))
         lead = computed_once(reference(road, body, proposals, strict))
-        motion = computed_once(drive_along(fitted(lead) if strict else lead, body, STEPS))
+        motion = computed_once(drive_along(fitted(lead) if strict else lead, body, STEPS, strict))
         scores = score(road, body, others, proposals, motion, strict)
         # of proposals that are as good the first one: the middle of the lane, and the slower one
         slack = 0.0 if strict else _AS_GOOD
         best = jnp.argmax(scores.total >= jnp.max(scores.total, -1, keepdims=True) - slack, -1)
         pick = lambda values: jnp.take_along_axis(values, best[:, None, None], 1)[:, 0]  # noqa: E731
         x, y, heading, v = (pick(values) for values in motion[:4])
+        path = (best // len(FRACTIONS))[:, None]
+        leads, offset = (jnp.take_along_axis(x, path, 1)[:, 0] for x in (road.worth > 0, road.offset))
         brakes = jnp.take_along_axis(scores.contact, best[:, None], 1)[:, 0] <= EMERGENCY_TIME
         if strict:
             brakes &= body.v <= EMERGENCY_SPEED
@@ -983,6 +995,7 @@ class PDMClosed:
         return Plan(
             trajectory=_centred(body, driven, now),
             best=best,
+            signal=jnp.where(leads, jnp.sign(offset - road.d), 0).astype(jnp.int32),
             brakes=brakes,
             scores=scores,
             tail=_centred(body, rest, now + (STEPS + 1) * DT),

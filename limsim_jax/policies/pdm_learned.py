@@ -229,13 +229,12 @@ class PDMHybrid:
         """PDM-Closed's trajectory for 2 s, and the corrected one up to 8 s."""
         del key
         past = remember(memory, state)
-        trajectory, _ = self.foresee(config, lane_map, state, past)
-        return Command(trajectory=trajectory), past
+        return self.foresee(config, lane_map, state, past)[0], past
 
     def foresee(
         self, config: Config, lane_map: LaneMap, state: State, past: Past
-    ) -> tuple[Trajectory, Float[Array, "E 16 3"]]:
-        """The trajectory, and the poses of the network in the frame of each ego."""
+    ) -> tuple[Command, Float[Array, "E 16 3"]]:
+        """What to do, and the poses of the network in the frame of each ego."""
         plan = self.closed.plan(config, lane_map, state, beyond=BEYOND)
         seen = features(config, lane_map, state, past, plan, self.strict_tuplan)
         weights = load_weights(self.path)
@@ -269,7 +268,7 @@ class PDMHybrid:
         trajectory = Trajectory(
             x=x, y=y, heading=heading, v=jnp.where(late, moved, v), t0=config.time(state.step), dt=DT
         )
-        return trajectory, poses
+        return Command(trajectory=trajectory, signal=plan.signal), poses
 
 
 # --- weights -----------------------------------------------------------------------------------------

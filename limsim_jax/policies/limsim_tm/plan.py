@@ -32,6 +32,7 @@ class Task(NamedTuple):
     driver: Driver  # [V]
     lead_gap: Float[Array, "V J"]  # m from the front bumper to who is to be followed; NO_GAP: nobody
     lead_v: Float[Array, "V J"]  # m/s
+    lead_a: Float[Array, "V J"]  # m/s^2; who brakes is taken to go on braking
     wall: Float[Array, " V"]  # m from the front bumper to the place beyond which it must not go
     other: Others
     merge: Merge
@@ -143,6 +144,7 @@ _REACTION = 0.5  # s at the present speed before braking hard (RSS)
 _RSS_UNTIL = 1.5  # s; later there will be another plan
 _APPROACH = 0.6  # of the comfortable deceleration: slows down for bends and limits ahead
 _STOPPING, _STOPPING_LATE = 0.8, 1.5  # of it: stops at lines, and at the end of a lane that it has to leave
+_ONSET = 1.0  # s in which that braking sets in
 _MERGE_BRAKING = 2.0  # m/s^2
 _STRETCH = 30.0  # m
 _HURRY = 2.5  # times the weight of efficiency
@@ -200,9 +202,25 @@ def speed_envelope(task: Task) -> Float[Array, "V M"]:
     at = way.step * jnp.arange(way.x.shape[-1], dtype=top.dtype)[None]
     square = lax.cummin(top * top + b * at, axis=1, reverse=True) - b * at
     room = jnp.maximum(task.wall[:, None] - at, 0)
-    # who still has to find a gap does not lose the speed of those it joins
-    b = driver.b * jnp.where(task.merge.urgency > 0, _STOPPING_LATE, _STOPPING)
-    return jnp.sqrt(jnp.maximum(jnp.minimum(square, 2 * b[:, None] * room), 0))
+    return jnp.sqrt(jnp.maximum(jnp.minimum(square, 2 * _stopping(task)[:, None] * room), 0))
+
+
+def _stopping(task: Task) -> Float[Array, " V"]:
+    """Braking at the wall, m/s^2; who still has to find a gap does not lose the speed of those it joins."""
+    return task.driver.b * jnp.where(task.merge.urgency > 0, _STOPPING_LATE, _STOPPING)
+
+
+def leaders(task: Task, t: Float[Array, "*#b"]) -> tuple[Float[Array, "*b J"], Float[Array, "*b J"]]:
+    """How far the leaders are `t` s from now, m from the front bumper now, and their speeds, m/s.
+
+    At constant speed, or at constant deceleration to a standstill (constant-acceleration heuristic: Kesting,
+    Treiber, Helbing, Phil. Trans. R. Soc. A 368, 2010).
+    """
+    shape = (task.lead_v.shape[0],) + (1,) * (t.ndim - 1) + (task.lead_v.shape[1],)
+    gap, v, a = (x.reshape(shape) for x in (task.lead_gap, task.lead_v, task.lead_a))
+    braking = jnp.maximum(-a, 0)
+    until = jnp.minimum(t[..., None], v / jnp.maximum(braking, 1e-3))
+    return gap + until * (v - braking * until / 2), v - braking * until
 
 
 def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
@@ -291,6 +309,7 @@ def _along(
     u = jnp.minimum(t, v0 / b)
     v = v0 - b * u
     parts.append((u * (v0 - b * u / 2), v, jnp.where(v > 0, -b, 0), jnp.zeros_like(v)))
+    parts.append(_late_stop(lattice, task))
     parts.append(_follow(lattice, model, task, envelope))
     shape = (*start.v.shape, -1, lattice.moments)
     s, v, a, jerk = (
@@ -300,6 +319,23 @@ def _along(
         for k in range(4)
     )
     return lax.cummax(s, axis=2), jnp.maximum(v, 0), a, jerk
+
+
+def _late_stop(lattice: Lattice, task: Task) -> tuple[Array, Array, Array, Array]:
+    """On at the present speed as long as that is all right, then to a stop at the wall."""
+    t, v0 = lattice.times()[None], task.start.v[:, None]
+    room = jnp.maximum(task.wall[:, None] - v0 * _ONSET / 2, 0.1)
+    b = jnp.clip(v0 * v0 / (2 * room), _stopping(task)[:, None], task.driver.b_max[:, None])
+    begins = jnp.maximum(room - v0 * v0 / (2 * b), 0) / jnp.maximum(v0, 0.1)
+    since = jnp.maximum(t - begins, 0)
+    rising = jnp.minimum(since, _ONSET)
+    v = v0 - b * (rising * rising / (2 * _ONSET) + since - rising)
+    a = jnp.where(v > 0, -b * rising / _ONSET, 0)
+    v = jnp.maximum(v, 0)
+    moved = jnp.cumsum((v[:, 1:] + v[:, :-1]) / 2 * lattice.dt, -1)
+    s = jnp.pad(moved, ((0, 0), (1, 0)))
+    jerk = jnp.where((since > 0) & (since < _ONSET) & (v > 0), -b / _ONSET, 0)
+    return s[:, None], v[:, None], a[:, None], jerk[:, None]
 
 
 def _follow(
@@ -312,15 +348,15 @@ def _follow(
     v = jnp.broadcast_to(start.v[:, None], (start.v.shape[0], share.shape[1]))
     none = jnp.zeros_like(v)
     wall = (task.wall + task.driver.s0)[:, None, None]
-    far = jnp.concatenate([task.lead_gap[:, None], wall], -1)
-    lead_v = jnp.concatenate([task.lead_v[:, None], jnp.zeros_like(wall)], -1)
-    is_lead = far < NO_GAP / 2  # [V 1 J]
+    is_lead = jnp.concatenate([task.lead_gap[:, None], wall], -1) < NO_GAP / 2  # [V 1 J]
 
     def step(carry: tuple[Array, ...], t: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         s, v, a = carry
         k = jnp.clip((s / way.step).astype(jnp.int32), 0, way.x.shape[-1] - 1)
         v0 = share * jnp.take_along_axis(envelope, k, 1)
-        gap = jnp.where(is_lead, far + lead_v * t - s[..., None], NO_GAP)
+        far, lead_v = leaders(task, jnp.broadcast_to(t, (1, 1)))
+        far, lead_v = jnp.concatenate([far, wall], -1), jnp.concatenate([lead_v, jnp.zeros_like(wall)], -1)
+        gap = jnp.where(is_lead, far - s[..., None], NO_GAP)
         ahead = jnp.where(is_lead, lead_v, v[..., None])
         wish = model(
             driver, gap=gap, v=v[..., None], v_lead=ahead, a_lead=jnp.zeros_like(gap), v0=v0[..., None]
@@ -364,12 +400,10 @@ def _costs(
     allowed = along(envelope)
     # against one speed for all samples: who gets to where more is allowed must not look slower for it
     slow, over = jnp.maximum(each(_fastest(task, envelope)) - v, 0), jnp.maximum(v - allowed, 0)
-    gap = jnp.minimum(
-        task.lead_gap[:, None, None] + task.lead_v[:, None, None] * t[..., None] - s[..., None],
-        NO_GAP,
-    )  # [V S H J]
+    far, lead_v = leaders(task, t)
+    gap = jnp.minimum(far - s[..., None], NO_GAP)  # [V S H J]
     # the gap that IDM wants, which grows with the speed at which one comes nearer
-    approach = v[..., None] - task.lead_v[:, None, None]
+    approach = v[..., None] - lead_v
     dynamic = each(driver.T)[..., None] + approach / (2 * jnp.sqrt(each(driver.a * driver.b)))[..., None]
     wanted = each(driver.s0)[..., None] + jnp.maximum(v[..., None] * dynamic, 0)
     close = jnp.maximum(1 - gap / wanted, 0).max(-1)
@@ -389,7 +423,6 @@ def _costs(
     # bounds
     beyond = jnp.maximum(s - jnp.maximum(each(task.wall), 0) - 0.3, 0)
     b_ego, b_lead = each(jnp.minimum(driver.b_max, 7.0)), 8.0
-    lead_v = task.lead_v[:, None, None]
     need = (v * _REACTION + v * v / (2 * b_ego) + 1.0)[..., None] - lead_v**2 / (2 * b_lead)
     rss = jnp.where(t <= _RSS_UNTIL, jnp.maximum(jnp.maximum(need, 0.5) - gap, 0).max(-1), 0)
     tight = jnp.maximum(jnp.abs(curvature) - each(jnp.tan(task.steering) / task.wheelbase), 0)

@@ -263,6 +263,7 @@ class LimSimTM:
         lead_v = jnp.concatenate(
             [state.v[index], jnp.take_along_axis(jnp.maximum(found.v, 0), nearest, 1)], -1
         )
+        leader = jnp.concatenate([index, jnp.take_along_axis(found.slot, nearest, 1)], -1)
         follows = found.on_way & (found.s <= 0)
         return Task(
             way=way,
@@ -272,6 +273,7 @@ class LimSimTM:
             driver=driver,
             lead_gap=lead_gap,
             lead_v=lead_v,
+            lead_a=state.a[leader],
             wall=wall[slot],
             other=Others(
                 prediction.x[found.slot], prediction.y[found.slot], prediction.heading[found.slot],
