@@ -488,7 +488,7 @@ def test_who_changes_lanes_signals_and_keeps_the_body_on_the_road():
         np.asarray(pdm.road_ahead(lane_map, state, slot, body, strict).offset[1]) for strict in (False, True)
     )
     np.testing.assert_allclose(theirs, pdm.OFFSETS)
-    free = 3.75 / 2 - half
+    free = 3.75 / 2 - half - pdm._EDGE
     assert free < 0.9
     np.testing.assert_allclose(ours, [0, -free, 1], atol=0.01)
 

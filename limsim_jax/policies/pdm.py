@@ -96,12 +96,14 @@ implementation; m/s^2 of braking in ours."""
 
 _POINTS, _STEP = 121, 2.0  # of the way: 240 m
 _KEEPS = 61  # points of the way on which all of the body keeps to the road: 120 m
+_EDGE = 0.3  # m from there to the edge, for what the tracker does not manage
 _LANES = 6  # of the way, beyond the first
 _LOOK = 10  # steps that the tracker looks ahead
 _EVERY = 2  # steps between two looks at the others
 _FAR = 1e6  # m
 _STANDS = 0.05  # m/s: who is slower stands (nuPlan)
-_MERGE_TIME, _MERGE_LEAST = 3.0, 12.0  # s and m in which a path comes to its offset
+_MERGE_TIME, _MERGE_LEAST = 3.0, 12.0  # s and m in which a path comes to an offset 2 m away, or farther,
+_KEEP_SHARE = 0.33  # and the least share of that for one that is nearer
 _CHANGE_WITHIN = 300.0  # m to the last place for a lane change, within which it is wished for
 _CHANGE_ROOM = 20.0  # m before that place, kept free to change lanes from a standstill
 _CHANGE_WORTH = 15.0  # m of progress that a required lane change counts for
@@ -212,9 +214,10 @@ def road_ahead(lane_map: LaneMap, state: State, slot: Int[Array, " V"], body: Bo
     across = side.astype(d.dtype) * (width(lane_map, lane, front) + width(lane_map, own, state.s[slot])) / 2
     offset = jnp.broadcast_to(jnp.asarray(OFFSETS, d.dtype), (*d.shape, 3))
     if not strict:
-        room = jnp.stack([way.right, way.left], -1)[:, :_KEEPS] - body.width[:, None, None] / 2
-        right, left = jnp.moveaxis(jnp.maximum(jnp.min(room, 1), 0)[..., None], 1, 0)
-        offset = jnp.clip(offset, -right, left)
+        # in a bend the corners swing out
+        taken = _EDGE + body.width[:, None] / 2 + jnp.abs(way.curvature) * body.length[:, None] ** 2 / 8
+        right, left = (jnp.min((x - taken)[:, :_KEEPS], 1)[:, None] for x in (way.right, way.left))
+        offset = jnp.clip(offset, -jnp.maximum(right, 0), jnp.maximum(left, 0))
     towards = jnp.stack([-across, jnp.sign(across) - across, jnp.zeros_like(across)], -1)
     offset = jnp.where(changes[:, None], towards, offset)
     ends = jnp.where(changes, body.front + within - _CHANGE_ROOM, _FAR)
@@ -455,10 +458,12 @@ def reference(road: Road, body: Body, proposals: Proposals, strict: bool) -> Ref
         d = jnp.broadcast_to(offset, s.shape)
         slope = bend = jnp.zeros_like(s)
     else:
-        # a cubic from where the vehicle is and points to
-        reach = jnp.maximum(_MERGE_TIME * body.v, _MERGE_LEAST)[:, None, None]
+        # a cubic from where the vehicle is and points to; a lane change takes longer than to keep the lane
+        shift = road.d[:, None, None] - offset
+        share = jnp.clip(jnp.abs(shift) / 2, _KEEP_SHARE, 1)
+        reach = share * jnp.maximum(_MERGE_TIME * body.v, _MERGE_LEAST)[:, None, None]
         u = jnp.clip((s - road.s[:, None, None]) / reach, 0, 1)
-        shift, slope0 = road.d[:, None, None] - offset, road.slope[:, None, None] * reach
+        slope0 = road.slope[:, None, None] * reach
         d = offset + shift * (1 - u * u * (3 - 2 * u)) + slope0 * u * (1 - u) ** 2
         slope = (shift * 6 * u * (u - 1) + slope0 * (1 - u) * (1 - 3 * u)) / reach
         bend = (shift * (12 * u - 6) + slope0 * (6 * u - 4)) / (reach * reach)
