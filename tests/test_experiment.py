@@ -84,6 +84,8 @@ def test_other_map_and_policy(write):
     assert (experiment.policy, experiment.ego.options) == ("constant_speed", {"speed": 3.0})
     (other,) = read_experiments(path, policy="like_traffic", map_file="roundabout")
     assert (other.policy, other.ego.options, other.map) == ("like_traffic", {}, "roundabout")
+    (same,) = read_experiments(path, policy="constant_speed")
+    assert same.ego.options == {"speed": 3.0}
     (own,) = read_experiments(path, policy="limsim_jax.policies.simple:ConstantSpeed")
     assert own.policy == "ConstantSpeed" and Episodes(own).policy == "ConstantSpeed"
 

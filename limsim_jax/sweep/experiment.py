@@ -155,7 +155,7 @@ def read_experiments(
     Args:
       path: of the file.
       map_file: another map than that of the file.
-      policy: another policy than that of the file.
+      policy: another policy than that of the file, without the file's options for that.
 
     Raises:
       ExperimentError: with the file and the field.
@@ -208,7 +208,8 @@ def _experiment(found: Mapping[str, Any], path: Path, map_file: str | None, poli
             found["traffic"] = traffic | {"drivers": str(drivers.resolve())}
     if policy is not None:
         ego: dict[str, Any] = dict(found.get("ego", {}))
-        ego.pop("options", None)
+        if policy != ego.get("policy", EgoTable.model_fields["policy"].default):
+            ego.pop("options", None)  # they are those of the other one
         found["ego"] = ego | {"policy": policy}
     try:
         return Experiment.model_validate(found)
