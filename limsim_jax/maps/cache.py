@@ -102,7 +102,9 @@ def store(name: str, value: Any) -> None:
 
 
 def _encode(value: Any) -> bytes:
-    payload = pickle.dumps(value, protocol=5)
+    buffer = io.BytesIO()
+    _Pickler(buffer, protocol=5).dump(value)
+    payload = buffer.getvalue()
     return _HEADER.pack(_MAGIC, len(payload), zlib.crc32(payload)) + payload
 
 
@@ -126,6 +128,15 @@ def _collector_off() -> Iterator[None]:
     finally:
         if was_on:
             gc.enable()
+
+
+class _Pickler(pickle.Pickler):
+    """Writes members of enumerations by value; Python 3.11.0 to 3.11.3 would ask for `getattr`."""
+
+    def reducer_override(self, obj: Any, /) -> Any:
+        if isinstance(obj, enum.Enum):
+            return type(obj), (obj.value,)
+        return NotImplemented
 
 
 class _Unpickler(pickle.Unpickler):
