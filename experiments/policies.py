@@ -109,7 +109,7 @@ def main() -> None:
             rows = [kept[s, p] for s in PAPER for p in POLICIES if (s, p) in kept]
             write_whole(file, json.dumps({"rows": rows}, indent=1) + "\n")
             head = "Regenerate: `python experiments/policies.py`\n\n"
-            write_whole(RESULTS / "policies.md", f"{head}{policies({'rows': rows})}\n")
+            write_whole(RESULTS / "policies.md", f"{head}{policies({'rows': rows}, few=True)}\n")
 
 
 if __name__ == "__main__":

@@ -197,26 +197,24 @@ def closed_loop(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
-def policies(result: dict[str, Any]) -> str:
-    """Scenarios and policies, with intervals; also of the first few seeds, as many as the paper has."""
+def policies(result: dict[str, Any], few: bool = False) -> str:
+    """Scenarios and policies, with intervals; `few`: also of the first seeds, as many as the paper has."""
 
-    def time(r: dict[str, Any], name: str) -> str:
-        return f"{r[name]:.3g}" if name in r else "not measured"
-
-    rows = [
-        "| scenario | policy | seeds | success, % | route completion, % | LimSim driving score "
-        "| contact at fault, % | decision, ms | per vehicle in a batch, ms |",
-        "|---|---|---:|---|---:|---|---|---:|---:|",
-    ]
-    parts = [[row, row | row["few"]] if "few" in row else [row] for row in result["rows"]]
+    times = {"decision_ms": "decision, ms", "amortised_ms": "per vehicle in a batch, ms"}
+    times = {name: title for name, title in times.items() if any(name in r for r in result["rows"])}
+    heads = ["scenario", "policy", "seeds", "success, %", "route completion, %", "LimSim driving score",
+             "contact at fault, %", *times.values()]  # fmt: skip
+    rows = [f"| {' | '.join(heads)} |", f"|---|---|---:|---|---:|---|---|{'---:|' * len(times)}"]
+    parts = [[row, row | row["few"]] if few and "few" in row else [row] for row in result["rows"]]
     for r in itertools.chain.from_iterable(parts):
         (success, low, high), (score, least, most) = ([100 * x for x in r["success"]], r["score"])
         fault, _, bound = (100 * x for x in r["at_fault_contacts"])
         theirs = f" ({PAPER[r['scenario']]})" if r["policy"] == "limsim_tm" else ""
+        took = "".join(f" {r[name]:.3g} |" if name in r else " not measured |" for name in times)
         rows.append(
             f"| {r['scenario']} | {r['policy']} | {r['seeds']:,} | {success:.1f} [{low:.1f}, {high:.1f}] "
             f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}]{theirs} "
-            f"| {fault:.1f} (at most {bound:.1f}) | {time(r, 'decision_ms')} | {time(r, 'amortised_ms')} |"
+            f"| {fault:.1f} (at most {bound:.1f}) |{took}"
         )
     return "\n".join(rows)
 
