@@ -199,9 +199,8 @@ def closed_loop(result: dict[str, Any]) -> str:
 
 def policies(result: dict[str, Any], few: bool = False) -> str:
     """Scenarios and policies, with intervals; `few`: also of the first seeds, as many as the paper has."""
-
-    times = {"decision_ms": "decision, ms", "amortised_ms": "per vehicle in a batch, ms"}
-    times = {name: title for name, title in times.items() if any(name in r for r in result["rows"])}
+    titles = {"decision_ms": "decision, ms", "amortised_ms": "per vehicle in a batch, ms"}
+    times = {name: title for name, title in titles.items() if any(name in r for r in result["rows"])}
     heads = ["scenario", "policy", "seeds", "success, %", "route completion, %", "LimSim driving score",
              "contact at fault, %", *times.values()]  # fmt: skip
     rows = [f"| {' | '.join(heads)} |", f"|---|---|---:|---|---:|---|---|{'---:|' * len(times)}"]

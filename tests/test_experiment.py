@@ -91,6 +91,11 @@ def test_other_map_and_policy(write):
 
 
 WRONG = {  # what to replace, by what, and the message
+    "a mistyped field that is needed": (
+        "horizon =",
+        "horizn =",
+        "horizn: no such field; known are name, map, horizon",
+    ),
     "an unknown field": ("slots = 32", "slotz = 32", "slotz: no such field; known are name, map, horizon"),
     "an unknown field in a table": ("rate = 300", "rate = 300\nspede = 3", "traffic.flow.0.spede: no such"),
     "a missing field": ("horizon = 20.0\n", "", "horizon: Field required"),

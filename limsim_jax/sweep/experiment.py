@@ -220,7 +220,8 @@ def _experiment(found: Mapping[str, Any], path: Path, map_file: str | None, poli
 def _first(error: ValidationError) -> str:
     """The first thing that is wrong, in the file's words."""
     errors = error.errors()
-    first = errors[0]
+    # a name that is mistyped is also missing: the culprit is what stands there
+    first = min(errors, key=lambda fault: fault["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in first["loc"] if not _is_branch(part))
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
