@@ -206,7 +206,29 @@ def test_kinds_carry_over_along_a_movement_of_several_lanes():
         after = straight("out", (40, 0), 0.0, 50.0)
         found = entries(network([before, through, first, second, after]))
         assert {e["type"] for e in found["through", "first"]} == {ConflictType.DIVERGE}
-        assert {e["type"] for e in found["through", "second"]} == {ConflictType.DIVERGE}
+        (later,) = found["through", "second"]
+        assert later["type"] == ConflictType.DIVERGE
+        # level with its start, though they have been near for longer
+        assert later["f_in"] == 0.0
+        assert later["s_in"] == pytest.approx(14 * math.sin(cut / 14), abs=0.05)
+
+
+def test_two_ways_that_join_end_level_whatever_lanes_they_consist_of():
+    """A right turn cut in two inside the area in which it joins the straight way."""
+    through = straight("through", (0, 0), 0.0, 40.0, junction="J", successors=("out",))
+    turn = arc("turn", (40.0, -14.0), 14.0, math.pi, -math.pi / 2, junction="J")
+    after = straight("out", (40, 0), 0.0, 50.0)
+    for left in (2.0, 5.0):  # m of the second piece: shorter and longer than vehicles are wide
+        cut = turn.length - left
+        first = lane_along(
+            turn.pose(np.linspace(0, cut, 200))[0], "first", junction="J", successors=("second",)
+        )
+        rest = turn.pose(np.linspace(cut, turn.length, 40))[0]
+        second = lane_along(rest, "second", junction="J", successors=("out",))
+        (earlier,) = entries(network([through, first, second, after]))["through", "first"]
+        assert earlier["type"] == ConflictType.MERGE
+        assert earlier["f_out"] == pytest.approx(first.length, abs=1e-4)
+        assert earlier["s_out"] == pytest.approx(40 - 14 * math.sin(left / 14), abs=0.05)
 
 
 # --- right of way -----------------------------------------------------------------------------

@@ -224,6 +224,9 @@ def replay(
         )
     if not 0 <= seed < 2**31:
         raise typer.BadParameter(f"{seed}; it has to be within 0 and 2^31 - 1", param_hint="--seed")
+    stored = _stored(opened, group, seed)
+    if stored is None:
+        print(f"note: the results hold no seed {seed} of {group[0]} ({group[1]}); it is run now")
     path.parent.mkdir(parents=True, exist_ok=True)
     network, lane_map, trace, ego, moments, metrics = _rebuild(opened, *group).replay(seed)
     for row in moments:
@@ -233,7 +236,6 @@ def replay(
         saved = f", had braked in time, would have avoided it: {' or '.join(able)}" if able else ""
         module = f", avoided by a reference {row['module']} module" if row.get("module") else ""
         print(f"{row['time']:6.1f} s  {row['kind']}{value}{who}{saved}{module}")
-    stored = _stored(opened, group, seed)
     if stored is not None and (differs := [x for x in metrics if not _alike(metrics[x], stored[x])]):
         print(f"note: not the episode that is stored: {', '.join(differs[:3])} differ; 'verify' may tell why")
     match path.suffix:

@@ -13,7 +13,7 @@ import itertools
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import flax.struct
@@ -537,12 +537,33 @@ def _classify(network: Network, lanes: Sequence[Lane], overlaps: list[Overlap]) 
                     if goes_on:
                         kinds[m] = kind
                         todo.append(m)
-    return [
-        Overlap(
-            first=o.first, second=o.second, s_in=o.s_in, s_out=o.s_out, f_in=o.f_in, f_out=o.f_out, type=kind
-        )
-        for o, kind in zip(overlaps, kinds, strict=True)
-    ]
+
+    def level(o: Overlap) -> Overlap:
+        """Where one way goes on beside the other, the stretch begins (or ends) level on both.
+
+        The end of the one is near a whole piece of the other: vehicles that follow each other through a
+        merge or a split measure their gap from there.
+        """
+        i, j = lanes[o.first], lanes[o.second]
+        diverges = o.type is ConflictType.DIVERGE
+        links = "predecessors" if diverges else "successors"
+        if o.type is ConflictType.CROSS or set(getattr(i, links)) & set(getattr(j, links)):
+            return o
+        edge, s, f = (0, "s_in", "f_in") if diverges else (-1, "s_out", "f_out")
+        at_s = _closest(i, o.s_in, o.s_out, j.xyz[edge])
+        at_f = _closest(j, o.f_in, o.f_out, i.xyz[edge])
+        if abs(at_s - getattr(o, s)) > abs(at_f - getattr(o, f)):
+            return replace(o, **{s: at_s})
+        return replace(o, **{f: at_f})
+
+    found = [replace(o, type=kind) for o, kind in zip(overlaps, kinds, strict=True)]
+    return [level(o) for o in found]
+
+
+def _closest(lane: Lane, start: float, end: float, point: Floats) -> float:
+    """Arc length (m) between `start` and `end` at which a lane comes closest to a point."""
+    s = np.linspace(start, end, max(2, math.ceil((end - start) / 0.05) + 1))
+    return float(s[np.argmin(np.hypot(*(lane.pose(s)[0][:, :2] - point[:2]).T))])
 
 
 # --- right of way -----------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,8 @@ from limsim_jax.maps.network import ImportReport, Lane, LaneType, MapError, Netw
 from limsim_jax.maps.routing import RouteTable, build_routes
 from limsim_jax.maps.signals import SignalTable, build_signals
 from limsim_jax.numerics import computed_once, safe_divide, safe_sqrt
+
+Floats = NDArray[np.float64]
 
 NO_LANE = -1
 """Row of the null lane."""
@@ -71,6 +73,11 @@ TURN_WINDOW = 4.0
 MIN_WIDTH = 2.7
 """m, of a lane on which any vehicle finds room: a bus is 2.55 m wide."""
 
+SIGHT = 50.0
+"""m that everybody has to see along its way: what it takes to stop from 70 km/h with 4 m/s^2."""
+
+_MOST = 12  # lanes that anybody looks over
+_BESIDE = 500.0  # m, beyond which it does not matter how far lanes run side by side
 _CELL = 8.0  # m, side of the cells that `project` looks up
 _CHUNK_LENGTH, _CHUNK_TURN = 32.0, 0.6  # m, rad: a candidate of `project` has at most about one closest point
 _JUMP = 1.5e-3  # m: closer host samples are a kink or a step
@@ -94,6 +101,7 @@ _LEAST = {  # least sizes of tables, so that all small maps have the same shapes
     "phases": 16,
     "links": 32,
     "movements": 64,
+    "sight": 4,
 }
 
 
@@ -118,6 +126,7 @@ class LaneMap:
     opposite: Int[Array, " L"]  # oncoming lane beside it
     may_change_left: Bool[Array, " L"]
     may_change_right: Bool[Array, " L"]
+    beside_s: Float[Array, "L 2"]  # m from its start that the left and the right neighbour run beside it
     successors: Int[Array, "L K"]  # padded with NO_LANE
     predecessors: Int[Array, "L K"]
     lane_type: Int[Array, " L"]  # index into LANE_TYPES
@@ -132,6 +141,8 @@ class LaneMap:
     conflicts: ConflictTable
     routes: RouteTable
     signals: SignalTable
+    lanes_in_sight: int = struct.field(pytree_node=False, default=0)
+    """Lanes that a vehicle may have to look over to see `SIGHT` m ahead."""
 
 
 # --- look-ups ----------------------------------------------------------------------------------------
@@ -481,7 +492,8 @@ def build_lane_map(
         **{name: _pad(table, num_lanes, inert.get(name, _inert(table))) for name, table in tables.items()},
         **_grid(raster, rows),
     }
-    lane_map = LaneMap(**arrays, **_rule_tables(network, goals, num_lanes))
+    sight = max(_lanes_in_sight(lanes, lane_rows(network)), _LEAST["sight"])
+    lane_map = LaneMap(**arrays, **_rule_tables(network, goals, num_lanes), lanes_in_sight=sight)
     return jax.tree.map(lambda array: jnp.asarray(_device_type(array)), lane_map)
 
 
@@ -576,6 +588,7 @@ def _lane_tables(network: Network, lanes: list[Lane]) -> dict[str, NDArray[Any]]
         "opposite": np.array([row_of(lane, lane.opposite) for lane in lanes]),
         "may_change_left": np.array([lane.may_change_left for lane in lanes]) & (left != NO_LANE),
         "may_change_right": np.array([lane.may_change_right for lane in lanes]) & (right != NO_LANE),
+        "beside_s": np.stack([_beside(lanes, rows, "left"), _beside(lanes, rows, "right")], -1),
         "successors": links("successors"),
         "predecessors": links("predecessors"),
         "lane_type": np.array([LANE_TYPES.index(lane.type) for lane in lanes]),
@@ -586,6 +599,49 @@ def _lane_tables(network: Network, lanes: list[Lane]) -> dict[str, NDArray[Any]]
         "junction": np.array([junctions.get(lane.junction or "", -1) for lane in lanes]),
         "valid": np.ones(len(lanes), bool),
     }
+
+
+def _beside(lanes: list[Lane], rows: Mapping[str, int], side: Literal["left", "right"]) -> Floats:
+    """m from the start of each lane to where its neighbour parts from it or a junction begins.
+
+    Where lanes fork, the way on which that comes first counts; after this lane `_BESIDE` m are enough.
+    """
+
+    def goes_on(lane: Lane, after: str) -> bool:
+        other = getattr(lanes[rows[after]], side)
+        beside = getattr(lane, side)
+        return (
+            lanes[rows[after]].junction is None and other in rows and other in lanes[rows[beside]].successors
+        )
+
+    length = np.array([lane.length for lane in lanes])
+    found = np.where([getattr(lane, side) in rows for lane in lanes], length, 0.0)
+    on = [
+        [rows[after] if goes_on(lane, after) else -1 for after in lane.successors if after in rows]
+        if getattr(lane, side) in rows
+        else []
+        for lane in lanes
+    ]
+    while True:
+        before = found.copy()
+        for row, after in enumerate(on):
+            if after:
+                found[row] = length[row] + min(_BESIDE, *(found[k] if k >= 0 else 0.0 for k in after))
+        if (found == before).all():
+            return found
+
+
+def _lanes_in_sight(lanes: list[Lane], rows: Mapping[str, int]) -> int:
+    """Most lanes beyond its own one that a vehicle looks over to see `SIGHT` m ahead; at most `_MOST`."""
+    reach = np.zeros(len(lanes))  # m that the shortest way over so many lanes has
+    for count in range(_MOST):
+        after = [[reach[rows[x]] for x in lane.successors if x in rows] for lane in lanes]
+        if min((min(ways) for ways in after if ways), default=SIGHT) >= SIGHT:
+            return count
+        reach = np.array(
+            [lane.length + min(ways, default=SIGHT) for lane, ways in zip(lanes, after, strict=True)]
+        )
+    return _MOST
 
 
 def _wide_until(lane: Lane) -> float:

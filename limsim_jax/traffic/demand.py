@@ -40,7 +40,7 @@ from limsim_jax.numerics import safe_sqrt
 from limsim_jax.traffic.car_following import desired_speed
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.motion import boxes
-from limsim_jax.traffic.neighbors import look_ahead, neighbors, other_lane, sort_vehicles
+from limsim_jax.traffic.neighbors import lanes_ahead, look_ahead, neighbors, other_lane, sort_vehicles
 from limsim_jax.traffic.vehicles import BODY, PARAMETERS, Population, sample_vehicles
 from limsim_jax.types import Config, Driver, Egos, Lights, Queues, Scenario, Schedule, Shape, State
 
@@ -1133,7 +1133,7 @@ def _lanes_ahead(
 ) -> tuple[Int[Array, "P D"], Float[Array, "P D"]]:
     """Lanes from the departure lane on, and m from the front bumper to their starts."""
     lanes, starts = [lane], [-s]
-    for _ in range(config.look_ahead_lanes):
+    for _ in range(lanes_ahead(config, lane_map)):
         starts.append(starts[-1] + lane_map.length[lanes[-1]])
         lanes.append(lane_map.routes.next_lane[lanes[-1], goal])
     return jnp.stack(lanes, -1), jnp.stack(starts, -1)

@@ -38,7 +38,7 @@ from limsim_jax.traffic.ego import (
     with_free,
 )
 from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, side_to_look, start
-from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes
+from limsim_jax.traffic.motion import CREEP_SPEED, Decision, accelerations, advance, boxes
 from limsim_jax.traffic.neighbors import (
     Ahead,
     Obstacles,
@@ -242,6 +242,7 @@ def _speeds(
     """Desired speed here, and the lower speed further on that asks for braking first, and how far it is."""
     driver = state.driver
     v0 = desired_speed(driver, lane_map.speed_limit[state.lane], curvature(lane_map, state.lane, state.s))
+    v0 = jnp.minimum(v0, _until_changed(lane_map, state))
     # lanes to come: limit and tightest bend
     lane = ahead.lane[:, 1:]
     limit = driver.speed_factor[:, None] * lane_map.speed_limit[lane]
@@ -258,6 +259,17 @@ def _speeds(
     first = jnp.argmin(speed * speed + driver.b[:, None] * distance, -1)[:, None]
     pick = lambda x: jnp.take_along_axis(x, first, -1)[:, 0]  # noqa: E731
     return v0, pick(speed), pick(distance)
+
+
+def _until_changed(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
+    """Speed that nobody who changes lanes exceeds, so that it is done before the two lanes part."""
+    beside = lane_map.beside_s[state.lane]
+    left = (state.side > 0) != state.crossed  # where the other lane is
+    room = jnp.where(left, beside[:, 0], beside[:, 1]) - state.s
+    time = jnp.maximum(state.driver.lane_change_time * (1 - state.progress), 0.1)
+    # who is faster already, as where somebody else has driven it, does not brake for that
+    least = jnp.maximum(state.v, CREEP_SPEED)
+    return jnp.where(state.side != 0, jnp.maximum(room / time, least), NO_GAP)
 
 
 @jax.named_scope("drive")

@@ -132,11 +132,9 @@ def place_beside(
     usable = ((lane_map.access[lane] >> state.shape.vehicle_class) & 1) == 1
     allowed &= usable & state.active & (state.side == 0) & ~lane_map.is_connector[state.lane]
     # time to finish before the lanes part
-    after = lane_map.routes.next_lane[state.lane, state.goal]
-    beside_after = jnp.where(left, lane_map.left[after], lane_map.right[after])
+    beside = lane_map.beside_s[state.lane]
     needed = jnp.maximum(state.v, CREEP_SPEED) * state.driver.lane_change_time
-    goes_on = (beside_after != NO_LANE) & ~lane_map.is_connector[after]  # nobody changes in a junction
-    allowed &= (lane_map.length[state.lane] - state.s > needed) | goes_on
+    allowed &= jnp.where(left, beside[:, 0], beside[:, 1]) - state.s > needed
     lane = jnp.where(allowed, lane, NO_LANE)
     return lane, side_s(lane_map, state.lane, state.s, side), allowed
 

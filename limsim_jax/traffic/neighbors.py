@@ -107,11 +107,16 @@ class Shelf:
         return jnp.searchsorted(keys, last, side="right", method="scan_unrolled").astype(jnp.int32)
 
 
+def lanes_ahead(config: Config, lane_map: LaneMap) -> int:
+    """How many lanes beyond the own one everybody looks at: more on maps of short lanes."""
+    return max(config.look_ahead_lanes, lane_map.lanes_in_sight)
+
+
 @jax.named_scope("look_ahead")
 def look_ahead(config: Config, lane_map: LaneMap, state: State) -> Ahead:
-    """Follow the route of every vehicle over `config.look_ahead_lanes` lanes beyond its own."""
+    """Follow the route of every vehicle over `lanes_ahead` lanes beyond its own."""
     lanes, starts = [state.lane], [-state.s]
-    for _ in range(config.look_ahead_lanes):
+    for _ in range(lanes_ahead(config, lane_map)):
         starts.append(starts[-1] + lane_map.length[lanes[-1]])
         lanes.append(lane_map.routes.next_lane[lanes[-1], state.goal])
     return Ahead(jnp.stack(lanes, -1), jnp.stack(starts, -1))
@@ -202,7 +207,7 @@ def neighbors(
 
     lanes, starts = [], []
     start, after = lane_map.length[lane] - s, lane
-    for _ in range(config.look_ahead_lanes):
+    for _ in range(lanes_ahead(config, lane_map)):
         following = lane_map.routes.next_lane[after, goal]
         # where the way ends, tails of vehicles that drive on may still be in front
         after = jnp.where(following == NO_LANE, lane_map.successors[after, 0], following)
@@ -223,7 +228,7 @@ def neighbors(
     skip = vehicle == me[None]
     vehicle, position = jnp.where(skip, vehicle2, vehicle), offset + jnp.where(skip, position2, position)
     vehicle, position = computed_once((vehicle, position))
-    for k in range(config.look_ahead_lanes):
+    for k in range(len(lanes)):
         new = (lead < 0) & (vehicle[k] >= 0)
         lead = jnp.where(new, vehicle[k], lead)
         lead_at = jnp.where(new, position[k], lead_at)

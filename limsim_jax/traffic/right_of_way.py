@@ -265,7 +265,8 @@ def _meet(
     s_in, s_out, f_in, f_out = (x[k, c][None] for x in (table.s_in, table.s_out, table.f_in, table.f_out))
     splits, merges = (kind == ConflictType.DIVERGE)[None], (kind == ConflictType.MERGE)[None]
     me = computed_once(_Sight(*(x.ravel()[row][None] for x in sight)))
-    wanted = shelf.key(foe, share(foe, jnp.where(splits, me.y, f_out)[0]))
+    level = me.y - s_in + f_in  # on the foe; splits begin together, or one way goes on over several lanes
+    wanted = shelf.key(foe, share(foe, jnp.where(splits, level, f_out)[0]))
     q = jnp.arange(_FOES)[:, None]
     place = shelf.first_from(order, wanted)[None] + jnp.where(splits, q - 1, -1 - q)
     index = computed_once(entry[jnp.clip(place, 0, count - 1)])  # [Q, P]
@@ -306,8 +307,8 @@ def _meet(
     until = jnp.where(missed, jnp.minimum(until, 0), until).reshape(n, _ROWS)
 
     # splits: who is ahead on the other way, until its rear is clear
-    in_front = there & splits & (other.y > jnp.maximum(me.y, 0)) & (other.y - other.length < f_out) & ~past
-    gap = jnp.where(follows, behind, jnp.where(in_front, other.y - other.length - me.y, NO_GAP))
+    in_front = there & splits & (other.y > jnp.maximum(level, 0)) & (other.y - other.length < f_out) & ~past
+    gap = jnp.where(follows, behind, jnp.where(in_front, other.y - other.length - level, NO_GAP))
     need = jnp.where(gap < NO_GAP, gap + other.v * other.v / (2 * b), 2 * NO_GAP)
     gap, need = computed_once((gap, need))
     best = gap[0], need[0], other.slot[0]

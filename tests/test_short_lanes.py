@@ -1,0 +1,139 @@
+"""Maps of short lanes: roads of a metre or two between junctions, ways through a junction in pieces."""
+
+import dataclasses
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import arc, lane_along, network, straight
+from traffic_worlds import bundled, drivers, shapes
+
+from limsim_jax.geometry import box_separation
+from limsim_jax.maps.lane_map import build_lane_map, lane_rows
+from limsim_jax.traffic.demand import start_state
+from limsim_jax.traffic.engine import Command, Traffic, _until_changed, drive
+from limsim_jax.traffic.lane_change import place_beside
+from limsim_jax.traffic.motion import boxes
+from limsim_jax.types import Config
+
+CUT = 10.0  # m of the turn in its first piece: it has parted from the straight way by 0.8 m there
+
+
+@functools.cache
+def town(pieces: int = 5):
+    """Two lanes, 2 m of road, a junction with a turn of two pieces, and roads of 1 m after it."""
+    turn = arc("turn", (102.0, 60.0), 60.0, -math.pi / 2, 0.7)
+    cut = np.linspace(0, CUT, 60), np.linspace(CUT, turn.length, 200)
+    first, second = (turn.pose(s)[0] for s in cut)
+    x, y = second[-1][:2]
+    lanes = [
+        straight("in", (0, 0), 0.0, 100.0, successors=("stub",), left="in_left", may_change_left=True),
+        straight("in_left", (0, 3.5), 0.0, 100.0, successors=("stub_left",), right="in"),
+        straight(
+            "stub",
+            (100, 0),
+            0.0,
+            2.0,
+            successors=("through", "first"),
+            left="stub_left",
+            may_change_left=True,
+        ),
+        straight("stub_left", (100, 3.5), 0.0, 2.0, successors=("through_left",), right="stub"),
+        straight("through", (102, 0), 0.0, 40.0, junction="J", successors=("out",), left="through_left"),
+        straight("through_left", (102, 3.5), 0.0, 40.0, junction="J", successors=("out_left",)),
+        lane_along(first, "first", junction="J", successors=("second",)),
+        lane_along(second, "second", junction="J", successors=("away",)),
+        straight("out", (142, 0), 0.0, 80.0, left="out_left"),
+        straight("out_left", (142, 3.5), 0.0, 300.0, right="out"),
+    ]
+    h = 0.7
+    step = np.array([math.cos(h), math.sin(h)])
+    for k in range(pieces):
+        name = "away" if k == 0 else f"away{k}"
+        after = (f"away{k + 1}",) if k < pieces - 1 else ("far",)
+        lanes.append(straight(name, np.array([x, y]) + k * step, h, 1.0, successors=after))
+    lanes.append(straight("far", np.array([x, y]) + pieces * step, h, 200.0))
+    net = network(lanes)
+    return net, build_lane_map(net), lane_rows(net)
+
+
+def vehicles(lane, s, v, goal):
+    """State of cars on lanes by name, each on its way to the end of another one."""
+    _, lane_map, rows = town()
+    is_goal = np.asarray(lane_map.routes.is_goal)
+    goals = [int(np.argmax(is_goal[rows[name]])) for name in goal]
+    return start_state(
+        lane_map, drivers(len(lane)), shapes(len(lane)), lane=jnp.asarray([rows[name] for name in lane]),
+        s=jnp.asarray(s), v=jnp.asarray(v), goal=jnp.asarray(goals), active=None,
+    )  # fmt: skip
+
+
+def test_how_far_lanes_run_side_by_side():
+    net, lane_map, rows = town()
+    found = {name: np.asarray(lane_map.beside_s[row]).tolist() for name, row in rows.items()}
+    assert found["in"] == [102.0, 0.0] and found["in_left"] == [0.0, 102.0]  # not into the junction
+    assert found["stub"] == [2.0, 0.0]
+    assert found["out"] == [80.0, 0.0]  # it ends there
+    assert found["far"] == [0.0, 0.0]
+    # where the ways part, the one that leaves the neighbour first counts
+    lanes = [dataclasses.replace(lane, junction=None) for lane in net.lanes.values()]
+    open_map = build_lane_map(network(lanes))
+    assert np.asarray(open_map.beside_s)[rows["stub"], 0] == 2.0
+    assert np.asarray(open_map.beside_s)[rows["stub_left"], 1] == 2.0  # nobody is to its right there
+
+
+def test_everybody_sees_far_enough():
+    # from the end of "in": 2 m, both pieces of the turn (42 m), five roads of 1 m, and the long one
+    assert town()[1].lanes_in_sight == 9
+    assert town(1)[1].lanes_in_sight == 5
+    assert bundled("highway")[1].lanes_in_sight == 4  # no fewer, so that maps share programs
+
+
+@pytest.mark.parametrize("v", [0.0, 12.0])
+def test_no_lane_change_begins_that_the_road_has_no_room_for(v):
+    """The road of 2 m goes on beside, but the junction after it does not."""
+    _, lane_map, _ = town()
+    time = float(drivers(1).lane_change_time[0])
+    needed = max(v, 5.0) * time
+    for s, expected in ((102.0 - needed - 1, True), (102.0 - needed + 1, False)):
+        state = vehicles(["in"], [s], [v], ["out_left"])
+        assert bool(place_beside(lane_map, state, jnp.ones(1, jnp.int32))[2][0]) == expected
+
+
+def test_who_changes_lanes_is_done_before_they_part():
+    _, lane_map, _ = town()
+    state = vehicles(["in", "in", "in_left"], [70.0, 70.0, 30.0], [6.0, 6.0, 6.0], ["out_left"] * 3)
+    time = float(state.driver.lane_change_time[0])
+    half = dataclasses.replace(
+        state,
+        side=jnp.asarray([1, 0, 1]),
+        progress=jnp.asarray([0.5, 0.0, 0.5]),
+        crossed=jnp.asarray([False, False, True]),
+    )
+    found = np.asarray(_until_changed(lane_map, half))
+    assert found[0] == pytest.approx(32 / (0.5 * time), rel=1e-5) and found[1] > 1e5
+    assert found[2] == pytest.approx(72 / (0.5 * time), rel=1e-5)  # has crossed: its old lane is to the right
+
+
+def test_a_way_in_pieces_is_followed_as_one():
+    """Who goes straight on stops behind somebody who stands on the second piece of the turn."""
+    _, lane_map, _ = town()
+    state = vehicles(["through", "second"], [6.0, 5.0], [5.0, 0.0], ["out", "far"])
+    brake = jnp.asarray([False, True])
+    separation = jax.vmap(jax.vmap(box_separation, (None, 0)), (0, None))
+
+    @jax.jit
+    def run(state):
+        def decision(state, _):
+            state, _ = drive(Config(dt=0.1), Traffic(), lane_map, state, command=Command(brake=brake))
+            box = boxes(lane_map, state)
+            return state, (separation(box, box)[0, 1], state.v[0])
+
+        return jax.lax.scan(decision, state, None, length=16)[1]
+
+    apart, v = run(state)
+    assert float(apart.min()) > 0.5
+    assert float(v[-1]) == 0.0
