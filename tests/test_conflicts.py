@@ -231,6 +231,18 @@ def test_two_ways_that_join_end_level_whatever_lanes_they_consist_of():
         assert earlier["s_out"] == pytest.approx(40 - 14 * math.sin(left / 14), abs=0.05)
 
 
+def test_lanes_that_lead_to_the_same_lane_merge_however_far_apart_they_end():
+    """A lane that ends beside another one and goes on as it: vehicles step aside there."""
+    lanes = [
+        straight("a", (0, 0), 0.0, 30.0, junction="J", successors=("out",)),
+        straight("b", (24, 3.5), 0.0, 6.0, junction="J", successors=("out",)),
+        straight("out", (30, 0), 0.0, 50.0),
+    ]
+    found = only(network(lanes), "a", "b")
+    assert found["type"] == ConflictType.MERGE
+    assert [found[name] for name in ("s_in", "s_out", "f_in", "f_out")] == [22.0, 30.0, 0.0, 6.0]
+
+
 # --- right of way -----------------------------------------------------------------------------
 
 

@@ -106,6 +106,7 @@ def test_avoidable_by_braking_by_hand():
     assert avoidable(20, 11.0, crossing)  # stands after 18.2 m
     assert not avoidable(20, 4.0, crossing)  # 18 m after 1 s: hits it
     assert avoidable(20, 0.5, (60.0, -13.5, np.pi / 2, 10.0))  # has passed long before
+    assert not avoidable(20, 8.0, (12.0, 0, np.pi, 40.0))  # through the ego within a second
 
 
 def test_avoidable_by_braking_is_what_a_simulation_finds():
@@ -239,6 +240,15 @@ def always(*flags):
         # only one of them: the other one's front corner meets its side
         ((0, 0, 0.08, 15.0), (-2, 3.5, 0.0, 15.0), {"changing": always(1, 0, 0)}, T.LATERAL, R.EGO),
         ((0, 0, 0.0, 15.0), (-2, 3.5, -0.08, 15.0), {"changing": always(0, 1, 0)}, T.LATERAL, R.OTHER),
+        # who has changed lanes when the hazard began is not excused by being done at the contact
+        ((0, 0, 0, 25.0), (11, 0, 0, 10.0), {"changing": lambda i: [0, i < 3, 0]}, T.FRONT, R.OTHER),
+        ((0, 0, 0, 10.0), (-11, 0, 0, 25.0), {"changing": lambda i: [i < 3, 0, 0]}, T.REAR, R.EGO),
+        # nor who begins to change after that
+        ((0, 0, 0.08, 15.0), (-2, 3.5, 0.0, 15.0), {"changing": lambda i: [i > 3, 0, 0]}, T.LATERAL, R.EGO),
+        # but what was long before the hazard does not matter
+        ((0, 0, 0, 15.0), (85, -54, np.pi / 2, 10.0), {"changing": lambda i: [0, i < 5, 0]}, T.FRONT, R.EGO),
+        # two that change lanes do not excuse each other
+        ((0, 0, 0, 15.0), (40, -24.0, np.pi / 2, 10.0), {"changing": always(1, 1, 0)}, T.FRONT, R.SHARED),
     ],
 )  # fmt: skip
 def test_responsibility(ego, other, flags, expected_type, expected):
@@ -286,6 +296,32 @@ def test_of_contacts_in_one_step_the_worst_is_described():
         assert found["contact_other"] == 1.0 + others.index(front)
         assert found["contact_delta_v"] == pytest.approx(1.0)
         assert found["max_delta_v"] == pytest.approx(5.0)
+
+
+def test_of_contacts_at_fault_in_one_step_the_hardest_is_described():
+    soft, hard = (7.0, 0, 0, 8.0), (11.0, 0, 0, 4.0)  # both at 1 s
+    for others in ([soft, hard], [hard, soft]):
+        found, _ = episode((0, 0, 0, 10.0), others, 40)
+        assert found["contact_other"] == 1.0 + others.index(hard)
+        assert found["contact_delta_v"] == found["max_delta_v"] == pytest.approx(3.0)
+
+
+def test_a_touch_is_as_soft_as_it_is():
+    found, _ = episode((0, 0, 0, 10.0), [(6.0, 0, 0, 9.0), FAR], 40)
+    assert found["max_delta_v"] == found["contact_delta_v"] == pytest.approx(0.5)
+
+
+def test_what_numbers_in_results_mean():
+    kinds = ["NONE", "STOPPED_EGO", "STOPPED_OTHER", "FRONT", "REAR", "LATERAL"]
+    assert [(k.name, int(k)) for k in ContactType] == [(name, k) for k, name in enumerate(kinds)]
+    blame = ["NONE", "EGO", "OTHER", "SHARED", "UNAVOIDABLE"]
+    assert [(k.name, int(k)) for k in Responsibility] == [(name, k) for k, name in enumerate(blame)]
+
+
+def test_slots_have_a_limit():
+    assert contact_init(4096).notes.shape == (4096,)
+    with pytest.raises(ValueError, match="4097 slots"):
+        contact_init(4097)
 
 
 def test_a_slot_that_was_empty_holds_a_new_vehicle():

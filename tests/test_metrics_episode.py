@@ -173,6 +173,23 @@ def test_completion_and_progress():
     assert found["limsim_corrected_drive"] == pytest.approx(75 + 25 * 10 / 15, rel=1e-4)
 
 
+def test_progress_beyond_the_goal_is_not_more_than_all():
+    found = measure(free(to_go=50.0 - np.arange(61.0)))
+    assert found["completion"] == 1.0 and found["progress"] == pytest.approx(60.0)
+
+
+def test_a_start_alone_has_no_mean_speed():
+    r = free(30)
+    r["active"][1:, 0] = False
+    found = measure(r)
+    assert found["duration"] == 0.0 and found["mean_speed"] is found["nuplan_score"] is None
+
+
+def test_half_a_metre_off_the_route():
+    found = measure(free(v=0.1, on_route=np.zeros(61, bool)))
+    assert found["distance"] == pytest.approx(0.6) and found["off_route"] == pytest.approx(1.0)
+
+
 def test_a_given_reference_counts_for_nuplan():
     found = measure(free(31), reference=True)
     assert found["nuplan_progress"] == pytest.approx(0.75, abs=1e-4)
@@ -204,6 +221,10 @@ def test_a_leader_that_comes_nearer():
     assert measure(closing(a=braking))["rss_no_response"] == 0.0
     # the TTC is below 3 s from 3.1 s on
     assert measure(closing(41))["ttc_exposed"] == pytest.approx(10 * DT, abs=1e-4)
+    # the step in which it starts has no duration
+    near = record(21, (0, 0, 0, 10.0), [(0, 0, 0, 0.0)])
+    near["box"][:, 1, 0] = near["box"][:, 0, 0] + LENGTH + 20.0
+    assert measure(near)["ttc_exposed"] == pytest.approx(2.0, abs=1e-4)
 
 
 def test_who_is_not_relevant_or_not_there_is_not_met():
@@ -221,7 +242,7 @@ def test_who_is_not_relevant_or_not_there_is_not_met():
 
 
 def test_who_touches_is_met_whatever_way_it_meant_to_go():
-    r = record(31, (0, 0, 0, 10.0), [(30, 0, 0, 0.0)])
+    r = record(31, (0, 0, 0, 20.0), [(30, 0, 0, 0.0)])  # it would be through the other in half a second
     assert measure(r)["contacts"] == 1.0
     r["relevant"][:, 1] = False
     found = measure(r)
@@ -246,6 +267,18 @@ def test_near_misses_are_episodes():
     r["box"][55, 1, 0] = r["box"][55, 0, 0] + LENGTH - 0.1
     found = measure(r)
     assert (found["near_misses"], found["contacts"], found["nuplan_ttc"]) == (1.0, 1.0, 0.0)
+
+
+def test_a_near_miss_with_contacts_is_none():
+    """Two are hit one after the other while the TTC to a third stays at 1 s."""
+    far, x = record(41, (0, 0, 0, 10.0), [(0, 0, 0, 0.0)] * 3), LENGTH + 10.0
+    far["box"][:, 1:, 1] = 50.0, -50.0, 100.0
+    far["box"][:, 3, :2] = far["box"][:, 0, :2] + np.array([x, 0.0])
+    assert measure(far)["near_misses"] == 1.0
+    for k, step in ((1, 10), (2, 14)):
+        far["box"][step, k, :2] = far["box"][step, 0, :2] + np.array([0.0, WIDTH])
+    found = measure(far)
+    assert (found["contacts"], found["near_misses"]) == (2.0, 0.0)
 
 
 def test_a_contact():
@@ -301,7 +334,19 @@ def test_nuplans_ttc_looks_ahead_and_in_junctions_aside(y, changing, junction, k
     r["in_junction"] = np.full(steps, junction)
     found = measure(r)
     assert found["min_ttc"] == pytest.approx(8.5 / 14 if y else 0.6, rel=1e-3)
+    assert found["min_distance"] == pytest.approx(8.5 if y else 6.0, rel=1e-4)  # near in time is no touch
     assert found["nuplan_ttc"] == kept
+
+
+@pytest.mark.parametrize(("x", "v"), [(-11.0, 10.0), (11.0, 0.0)])
+def test_nuplans_ttc_does_not_ask_for_more_than_the_ego_can_do(x, v):
+    """In a junction, somebody 0.6 s behind; and a standing ego that somebody comes to from ahead."""
+    r = record(31, (0, 0, 0, v), [(x, 0, 0, 0.0)], in_junction=np.ones(31, bool))
+    r["box"][:, 1, 0] = r["box"][:, 0, 0] + x
+    r["velocity"][:, 1] = [v - np.sign(x) * 10.0, 0.0]
+    found = measure(r)
+    assert found["min_ttc"] == pytest.approx(0.6, rel=1e-3)
+    assert found["nuplan_ttc"] == 1.0
 
 
 def test_speeding():
@@ -311,6 +356,7 @@ def test_speeding():
     assert found["max_overspeed"] == pytest.approx(2.0)
     assert found["overspeed"] == pytest.approx(2.0 * 14 * DT, rel=1e-4)
     assert found["nuplan_speed_limit"] == pytest.approx(1 - 2.8 / (2.23 * 6), rel=1e-4)
+    assert measure(free(v=17.0))["overspeed"] == pytest.approx(2.0 * 6, rel=1e-4)  # not for the start
 
 
 def test_off_the_road_and_off_the_route():
@@ -338,7 +384,14 @@ def test_against_the_flow():
     found = measure(free(lane_heading=heading))
     assert found["against_flow"] == pytest.approx(11.0, abs=1e-3)
     assert (found["wrong_way"], found["nuplan_driving_direction"]) == (1.0, 0.0)
+    # a step off the lanes neither adds nor takes away
+    gap = np.arange(61) == 23
+    heading = np.where((np.arange(61) >= 20) & (np.arange(61) < 27), np.pi, 0.0)
+    assert measure(free(lane_heading=heading, on_lane=~gap))["against_flow"] == pytest.approx(2.0, abs=1e-3)
+    # who stands, or only rolls, goes nowhere
+    assert measure(free(v=0.0))["wrong_way"] == measure(free(v=0.05))["wrong_way"] == 0.0
     # without a lane there is no direction
+    heading = np.full(61, np.pi)
     assert measure(free(lane_heading=heading, on_lane=np.zeros(61, bool)))["against_flow"] == 0.0
 
 
@@ -387,6 +440,24 @@ def test_an_ego_that_left_is_not_followed_by_another():
     assert found["success"] == found["completion"] == 1.0
     assert found["wrong_way"] == found["off_road"] == found["max_overspeed"] == 0.0
     assert found["min_acceleration"] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_an_ego_that_was_lost_is_not_followed_by_another():
+    r = free(61)
+    r["active"][30:35, 0] = False
+    r["off_road"] = np.arange(61) > 34
+    found = measure(r)
+    assert found["duration"] == pytest.approx(2.9) and found["distance"] == pytest.approx(29.0)
+    assert found["success"] == found["off_road"] == 0.0
+
+
+def test_an_ego_that_enters_late_starts_then():
+    r = free(61)
+    r["active"][:5, 0] = False
+    r["arrived"] = np.arange(61) < 5  # whoever had the slot before
+    found = measure(r)
+    assert found["duration"] == pytest.approx(5.5) and found["distance"] == pytest.approx(55.0)
+    assert found["arrived"] == 0.0
 
 
 # --- what must not matter ------------------------------------------------------------------------------
@@ -466,6 +537,33 @@ def test_slots_do_not_matter():
         on_host(one(as_steps(alone))[0]) | {"contact_other": 0},
         on_host(one(as_steps(empty))[0]) | {"contact_other": 0},
     )
+
+
+def side_by_side():
+    """The ego drifts to its left, off the middle of its lane, next to another one, first 0.15 m away."""
+    r = record(61, (0, 0, 0.02, 10.0), [(1.0, 2.15, 0.02, 10.0)], lane_heading=np.zeros(61))
+    r["box"][30:, 1, 1] += 0.4
+    return r
+
+
+@pytest.mark.parametrize("make", [lambda: random_record(5, n=SLOTS), side_by_side])
+def test_where_north_is_does_not_matter(make):
+    """The world turned and moved as a whole."""
+    r = make()
+    angle, move = 2.2, np.array([31.0, -17.0])
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, s], [-s, c]])  # of rows
+    turned = {k: x.copy() for k, x in r.items()}
+    turned["box"][..., :2] = r["box"][..., :2] @ turn + move
+    turned["box"][..., 2] += angle
+    turned["velocity"] = r["velocity"] @ turn
+    turned["lane_heading"] = r["lane_heading"] + angle
+    one, other = measure(r), measure(turned)
+    assert one["distance"] > 20
+    for name, value in one.items():
+        assert other[name] == (value if value is None else pytest.approx(value, rel=1e-3, abs=2e-3)), name
+    if make is side_by_side:
+        assert 0 < one["rss_lateral"] < 1
 
 
 def test_the_size_of_the_batch_does_not_matter():

@@ -54,6 +54,7 @@ def test_intervals_of_shares_are_scipys(level):
             for ours, method in ((wilson, "wilson"), (clopper_pearson, "exact")):
                 theirs = result.proportion_ci(level, method=method)
                 found = ours(events, trials, level)
+                assert found[0] == pytest.approx(events / trials)
                 assert found.low == pytest.approx(theirs.low, abs=1e-12)
                 assert found.high == pytest.approx(theirs.high, abs=1e-12)
 
@@ -144,6 +145,7 @@ def test_pairs_take_out_what_seeds_share():
         (lambda: wilson(0, 0), r"0 events in 0 trials"),
         (lambda: clopper_pearson(-1, 5), r"-1 events in 5 trials"),
         (lambda: wilson(cast(Any, 0.5), 2), r"events must be a whole number, not 0.5"),
+        (lambda: wilson(1, 2, 1.5), r"the level must lie between 0 and 1, not 1.5"),
         (lambda: wilson(1, 2, 95), r"the level must lie between 0 and 1, not 95; 95 % is 0.95"),
         (lambda: zero_event_bound(0), r"0 events in 0 trials"),
         (lambda: bootstrap([]), r"values must be a list of numbers, one per seed; it has shape \(0,\)"),

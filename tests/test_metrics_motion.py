@@ -15,6 +15,7 @@ from limsim_jax.metrics.motion import (
     motion_init,
     motion_result,
     motion_update,
+    stream,
 )
 from limsim_jax.metrics.reductions import on_host
 
@@ -57,10 +58,13 @@ def measure(v, a, heading):
     return on_host(streamed(*(jnp.asarray(x, jnp.float32) for x in (v, a, heading))))
 
 
-@pytest.mark.parametrize("n", [23, 24, 60])
+@pytest.mark.parametrize(
+    ("n", "dt", "windows"),
+    [(n, DT, (8, 15, 5, 5)) for n in (23, 24, 60)] + [(24, 0.5, (3, 3, 3, 4))],  # at least the order and one
+)
 @pytest.mark.parametrize("name", ["acceleration", "jerk", "yaw_rate", "yaw_acceleration"])
-def test_a_stream_gives_what_scipy_gives_on_the_whole_record(name, n):
-    kept = getattr(filters(DT), name)
+def test_a_stream_gives_what_scipy_gives_on_the_whole_record(name, n, dt, windows):
+    kept = getattr(filters(dt), name)
     rng = np.random.default_rng(n)
     x = rng.normal(size=(n, 2)) + 3.0
 
@@ -72,14 +76,24 @@ def test_a_stream_gives_what_scipy_gives_on_the_whole_record(name, n):
     rest, valid = filter_result(kept, carry)
     assert valid.all()
     found = np.concatenate([np.asarray(y)[np.asarray(new)], rest])
-    smooth = savgol(x, 8, 2, axis=0)
+    smooth = savgol(x, windows[0], 2, axis=0)
     expected = {
         "acceleration": smooth,
-        "jerk": savgol(smooth, 15, 2, deriv=1, delta=DT, axis=0),
-        "yaw_rate": savgol(x, 5, 2, deriv=1, delta=DT, axis=0),
-        "yaw_acceleration": savgol(x, 5, 3, deriv=2, delta=DT, axis=0),
+        "jerk": savgol(smooth, windows[1], 2, deriv=1, delta=dt, axis=0),
+        "yaw_rate": savgol(x, windows[2], 2, deriv=1, delta=dt, axis=0),
+        "yaw_acceleration": savgol(x, windows[3], 3, deriv=2, delta=dt, axis=0),
     }[name]
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_filter_whose_edges_look_further_than_its_middle_is_refused():
+    def odd(x):
+        y = x.copy()
+        y[0] += x[20]
+        return y
+
+    with pytest.raises(ValueError, match="edges"):
+        stream(odd, 9)
 
 
 def test_extremes_are_those_of_the_whole_record():

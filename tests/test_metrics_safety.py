@@ -181,13 +181,21 @@ def test_gradients_are_finite():
 
 def test_ttc_1d_headway_and_drac_by_hand():
     gap, v, lead = (
-        f([30.0, 30.0, 30.0, NO_GAP, -0.5, 10.0]),
-        f([20, 10, 15, 20, 20, 0]),
-        f([10, 10, 20, 0, 10, 0]),
+        f([30.0, 30.0, 30.0, NO_GAP, -0.5, 10.0, 8.0]),
+        f([20, 10, 15, 20, 20, 0, 0.5]),
+        f([10, 10, 20, 0, 10, 0, 0.1]),
     )
-    np.testing.assert_allclose(ttc_1d(gap, v, lead), [3.0, NONE, NONE, NONE, 0.0, NONE], rtol=1e-6)
-    np.testing.assert_allclose(time_headway(gap, v), [1.5, 3.0, 2.0, NONE, 0.0, NONE], rtol=1e-6)
-    np.testing.assert_allclose(drac(gap, v, lead), [10**2 / 60, 0, 0, 0, 10**2 / 0.02, 0], rtol=1e-5)
+    np.testing.assert_allclose(ttc_1d(gap, v, lead), [3.0, NONE, NONE, NONE, 0.0, NONE, 20.0], rtol=1e-6)
+    np.testing.assert_allclose(time_headway(gap, v), [1.5, 3.0, 2.0, NONE, 0.0, NONE, 16.0], rtol=1e-6)
+    np.testing.assert_allclose(drac(gap, v, lead), [10**2 / 60, 0, 0, 0, 10**2 / 0.02, 0, 0.01], rtol=1e-5)
+
+
+def test_rss_with_its_usual_parameters_by_hand():
+    # 0.5 s at 2 m/s^2, then 4 m/s^2, behind one that brakes with 8 m/s^2
+    assert float(rss_longitudinal(f(10.0), f(5.0))) == pytest.approx(5 + 0.25 + 11**2 / 8 - 25 / 16)
+    # each 0.5 s at 0.2 m/s^2 towards the other, then 0.8 m/s^2, and 0.1 m
+    ways = (0.8 + 0.9) / 2 * 0.5 + 0.9**2 / 1.6, 0.1 / 2 * 0.5 + 0.1**2 / 1.6
+    assert float(rss_lateral(f(0.8), f(0.0))) == pytest.approx(0.1 + sum(ways), rel=1e-5)
 
 
 def test_drac_is_the_braking_that_just_avoids_the_leader():

@@ -11,6 +11,7 @@ from limsim_jax.metrics.scores import (
     against_flow_init,
     against_flow_update,
     carla_score,
+    limsim_comfort,
     limsim_corrected,
     limsim_efficiency,
     limsim_faithful,
@@ -223,7 +224,7 @@ def record(n, seed=None):
     }  # fmt: skip
     if seed is not None:
         steady |= {
-            "v": rng.uniform(8, 14.2, n), "a": rng.normal(size=n) * 1.5,
+            "v": rng.uniform(8, 14.2, n), "a": rng.normal(size=n) * 1.5 + 4 * np.sin(np.arange(n) / 9 + seed),
             "heading": np.cumsum(rng.normal(size=n)) * 0.02, "v_others": rng.uniform(5, 16, n),
             "others": rng.random(n) < 0.5, "ttc": rng.uniform(0.5, 20, n), "red_light": rng.random(n) < 0.2,
             "in_junction": rng.random(n) < 0.4, "waits_at_red": rng.random(n) < 0.2,
@@ -231,9 +232,16 @@ def record(n, seed=None):
     return steady
 
 
-def test_limsim_streams_are_loops_over_the_record():
+def test_limsim_comfort_by_its_bounds():
+    a, b, c, d = np.random.default_rng(1).uniform(-1, 1, (4, 500)) * np.array([[6.0], [6.0], [2.2], [2.2]])
+    np.testing.assert_allclose(limsim_comfort(f(a), f(b), f(c), f(d)), comfort(a, b, c, d), atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_limsim_streams_are_loops_over_the_record(seed):
     n = 64  # the start, six seconds, and three steps that do not count
-    r = record(n, 0)
+    r = record(n, seed)
+    r["a"][0] = r["a"][10] - 0.7  # the jerk of the first second is one that costs something, not all
     faithful, corrected, worst = judged(r, success=False, completion=0.7, failed=True)
     lateral = np.concatenate([[0.0], r["v"][1:] * np.diff(r["heading"]) / DT])
     c, e, ec, s, speeding, reds = [], [], [], [], [], 0
@@ -305,4 +313,5 @@ def test_what_the_corrected_version_corrects():
 
 def test_without_a_full_second_there_is_no_limsim_score():
     assert [bool(x.valid) for x in drive(record(10))] == [False, False]
+    assert [bool(x.valid) for x in drive(record(15))] == [True, False]  # too short for the jerk's filter
     assert [bool(x.valid) for x in drive(record(25))] == [True, True]

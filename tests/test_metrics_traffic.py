@@ -75,6 +75,16 @@ def test_edie_by_hand():
     assert found["delay_per_km"] == pytest.approx(10 / 0.4, rel=1e-3)
 
 
+def test_the_clock_need_not_start_at_0():
+    r = record([0, 50, 100], [10, 10, 20], 101)
+    expected = run(r, interval=4.0, intervals=3)
+    r["t"] += 7.0
+    r["entered"] += 7.0
+    for one, other in zip(expected, run(r, interval=4.0, intervals=3), strict=True):
+        for name, value in one.items():
+            np.testing.assert_allclose(np.array(value, float), np.array(other[name], float), rtol=1e-4)
+
+
 def test_only_the_region_and_active_slots_count():
     r = record([0, 50, 100], [10, 10, 20], 101)
     r["active"] = r["active"] & np.array([True, True, False])
@@ -164,6 +174,23 @@ def test_headways_and_saturation_flow():
 def test_who_stops_at_a_detector_has_passed_it_once():
     _, by = run(record([40.0], 10.0, 40), [(0, 50.0)])  # a metre per step: it is there after ten
     assert by["flow_per_hour"][0, 0] == pytest.approx(3600 / 3.9, rel=1e-5)
+
+
+def test_the_start_itself_is_no_passage():
+    r = record([50.0], 10.0, 40)
+    r["dx"][0] = 1.0  # whatever it did before
+    found, by = run(r, [(0, 50.0)])
+    assert by["flow_per_hour"][0, 0] == 0.0 and found["vehicle_km"] == pytest.approx(0.039, rel=1e-4)
+
+
+def test_short_records_and_short_headways():
+    """Not a second, and vehicles 0.3 and 0.7 s apart, side by side as on a wide lane."""
+    found, by = run(record([49.0, 46.0, 39.0], 10.0, 13), [(0, 50.0)])
+    assert by["flow_per_hour"][0, 0] == pytest.approx(3 * 3600 / 1.2, rel=1e-4)
+    assert by["headway_histogram"][0, :3].tolist() == [0.5, 0.5, 0.0]  # bins of half a second
+    found, by = run(record([49.0], 10.0, 9), [(0, 50.0)])
+    assert by["flow_per_hour"][0, 0] == pytest.approx(3600 / 0.8, rel=1e-4)
+    assert found["flow_per_hour"] == pytest.approx(3600 * 8 / (0.8 * TOTAL), rel=1e-4)
 
 
 def test_a_lane_change_is_no_passage():

@@ -45,6 +45,7 @@ ABSENT = 1e6
 
 _STEP = 0.25  # m, sampling of the centre lines
 _REACH = 200.0  # m, how far from a merge or split outside junctions two lanes are compared
+_STEP_ASIDE = 8.0  # m at the end of a lane that jumps aside to another one
 _TOUCH = 0.05  # m, a stretch that starts or ends this close to an end of its lane reaches it
 
 
@@ -290,7 +291,30 @@ def find_overlaps(network: Network, lanes: Sequence[Lane], reach: float) -> list
         )
         for region, s in zip(regions, stretches.tolist(), strict=True)
     ]
-    return _classify(network, lanes, overlaps)
+    return [*(found := _classify(network, lanes, overlaps)), *_merges_with_a_jump(lanes, found)]
+
+
+def _merges_with_a_jump(lanes: Sequence[Lane], overlaps: Sequence[Overlap]) -> Iterator[Overlap]:
+    """Ends of lanes that lead to the same lane though they are too far apart for their paths to meet.
+
+    Some files let a lane end beside another one and go on as it: vehicles step aside there.
+    """
+    index = {lane.id: k for k, lane in enumerate(lanes)}
+    known = {(o.first, o.second) for o in overlaps if o.type is ConflictType.MERGE}
+    for siblings in _sharing({lane.id: lane for lane in lanes}, "successors").values():
+        for i, j in itertools.combinations(sorted(index[lane.id] for lane in siblings), 2):
+            if (i, j) not in known:
+                known.add((i, j))
+                ends = [(max(0.0, lanes[k].length - _STEP_ASIDE), lanes[k].length) for k in (i, j)]
+                yield Overlap(
+                    first=i,
+                    second=j,
+                    s_in=ends[0][0],
+                    s_out=ends[0][1],
+                    f_in=ends[1][0],
+                    f_out=ends[1][1],
+                    type=ConflictType.MERGE,
+                )
 
 
 def _sharing(lanes: Mapping[str, Lane], links: str) -> dict[str, list[Lane]]:

@@ -334,7 +334,7 @@ class EgoMetrics:
         )
         hit = contact.contacts > carry.contact.contacts
         near = carry.near.add(least < NEAR_MISS[0], least > NEAR_MISS[1])
-        near_contact = near.inside & ((carry.near_contact & carry.near.inside) | hit)
+        near_contact = near.inside & (carry.near_contact | hit)
         near_contacts = carry.near_contacts + (near_contact & ~carry.near_contact).astype(jnp.int32)
 
         # --- nuPlan's view of the others

@@ -38,24 +38,22 @@ def on_host(results: dict[str, Measured]) -> dict[str, Any]:
 
 
 class Mean(NamedTuple):
-    """Weighted mean of the samples so far."""
+    """Mean of the samples so far."""
 
     total: Float[Array, "*b"]
-    weight: Float[Array, "*b"]
+    weight: Float[Array, "*b"]  # how many
 
     @classmethod
     def empty(cls, *shape: int) -> Mean:
         """Of no samples."""
         return cls(jnp.zeros(shape), jnp.zeros(shape))
 
-    def add(
-        self, x: Float[Array, "*b"], where: Bool[Array, "*b"], weight: Float[Array, "*b"] | float = 1.0
-    ) -> Mean:
+    def add(self, x: Float[Array, "*b"], where: Bool[Array, "*b"]) -> Mean:
         """One more sample, if `where`."""
-        return Mean(self.total + jnp.where(where, x * weight, 0), self.weight + jnp.where(where, weight, 0.0))
+        return Mean(self.total + jnp.where(where, x, 0), self.weight + where.astype(self.weight.dtype))
 
     def result(self) -> Measured:
-        """The mean; invalid without weight."""
+        """The mean; invalid without samples."""
         return measured(safe_divide(self.total, self.weight), self.weight > 0)
 
 

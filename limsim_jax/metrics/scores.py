@@ -50,8 +50,8 @@ from limsim_jax.numerics import masked_sum, safe_divide
 NUPLAN_WEIGHTS = {"progress": 5.0, "ttc": 5.0, "speed_limit": 4.0, "comfort": 2.0}
 """Of the weighted mean in nuPlan's score."""
 
-NUPLAN_TTC = (0.95, 0.1, 3.0)
-"""s: TTC to exceed, step and horizon of the projection."""
+NUPLAN_TTC = (0.95, 0.1)
+"""s: TTC to exceed, and step of the projection; its horizon of 3 s is beyond that."""
 
 NUPLAN_PROGRESS = (2.0, 0.2)
 """m, below which progress counts as this; ratio to the reference that counts as making progress."""
@@ -170,7 +170,7 @@ def nuplan_ttc(
     nuPlan looks at 0.1, 0.2, ... s only: a shorter touch between two of these times is not seen, and a
     contact at 0.92 s is found at 1.0 s.
     """
-    bound, step, _ = NUPLAN_TTC
+    bound, step = NUPLAN_TTC
     first = jnp.maximum(jnp.ceil(begin / step - 1e-4), 1) * step
     return ~(relevant & (first <= cease + 1e-4 * step) & (first <= bound))
 

@@ -187,9 +187,9 @@ class TrafficMetrics:
         on_now = (lane == step.lane[None]) & ~step.left[None]
         behind_now = step.s - step.dx
         passed_now = on_now & (behind_now[None] < place) & (place <= step.s[None])
-        on_before = (lane == carry.lane[None]) & handed_over[None] & ~on_now
+        on_before = (lane == carry.lane[None]) & handed_over[None]
         passed_before = on_before & (carry.s[None] < place) & (place <= (carry.s + step.dx)[None])
-        passed = (passed_now | passed_before) & drove[None] & (step.dx > 0)[None]
+        passed = (passed_now | passed_before) & drove[None]
         way = place - jnp.where(passed_now, behind_now[None], carry.s[None])
         time = step.t - self.dt * (1 - safe_divide(way, jnp.broadcast_to(step.dx[None], way.shape)))
         any_passed = passed.any(1)
