@@ -91,6 +91,8 @@ SAME: dict[tuple[str, str, str], str] = {
     ("blame", "contact_update", "(number > 0) & (carry.contacts == 0) → carry.contacts == 0"): (
         "invalid before the first contact"
     ),
+    ("blame", "avoidable_by_braking", "1 → 2"): "any end before the beginning means never",
+    ("blame", "contact_update", "0 → 1"): "flags are larger, and without a hazard notes are not used",
     ("scores", "limsim_update", "1 → 2"): "seconds that are not full do not count",
     ("scores", "limsim_corrected", "0 → 1"): "the filters need two seconds anyway",
     ("traffic", "TrafficMetrics.init", "-1 → 1"): "nobody has passed anything before the start",
@@ -288,7 +290,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 def why(row: dict[str, Any]) -> str | None:
     """Why a survivor behaves as the original does; None if it does not, or nobody has looked."""
     if row["kind"] == "threshold":
-        return "measured quantities are never equal"
+        return "at equality, which measured quantities hardly ever meet; not judged one by one"
     return SAME.get((row["module"], row["function"], row["change"]))
 
 

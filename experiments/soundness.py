@@ -4,7 +4,7 @@
 
 Every episode has other vehicles at the start, other arrivals, drivers and goals. By default on the bundled
 maps, and on CARLA's towns where the folder of real maps is there. Writes
-experiments/results/soundness.json and .md.
+experiments/results/soundness.json and .md; maps that are not named keep their rows.
 """
 
 from __future__ import annotations
@@ -119,20 +119,21 @@ def main() -> None:
     parser.add_argument("--out", default="soundness")
     options = parser.parse_args()
     use_all_cores()
-    rows = []
+    file = RESULTS / f"{options.out}.json"
+    rows = {row["map"]: row for row in json.loads(file.read_text())["maps"]} if file.exists() else {}
     for name in options.map:
         rate = options.rate or RATES.get(name, OTHER_RATE)
         path, bundled = bundled_maps().get(name) or name, name in bundled_maps()
         count = options.episodes if bundled else options.town_episodes
         slots, initial = (SLOTS.get(name, 64), INITIAL) if bundled else (128, IN_TOWN)
         row = episodes(path, rate, count, slots=slots, chunk=options.chunk, initial=initial)
-        rows.append(row)
+        rows[row["map"]] = row
         print(json.dumps(row), flush=True)
         jax.clear_caches()
     RESULTS.mkdir(exist_ok=True)
     head = "Regenerate: `python experiments/soundness.py`\n\n"
-    (RESULTS / f"{options.out}.json").write_text(json.dumps({"maps": rows}, indent=1) + "\n")
-    (RESULTS / f"{options.out}.md").write_text(head + table(rows) + "\n")
+    file.write_text(json.dumps({"maps": list(rows.values())}, indent=1) + "\n")
+    (RESULTS / f"{options.out}.md").write_text(head + table(list(rows.values())) + "\n")
 
 
 if __name__ == "__main__":

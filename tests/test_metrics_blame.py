@@ -107,6 +107,10 @@ def test_avoidable_by_braking_by_hand():
     assert not avoidable(20, 4.0, crossing)  # 18 m after 1 s: hits it
     assert avoidable(20, 0.5, (60.0, -13.5, np.pi / 2, 10.0))  # has passed long before
     assert not avoidable(20, 8.0, (12.0, 0, np.pi, 40.0))  # through the ego within a second
+    # a leader that crawls: 19.5 m/s of difference and 25 m need 7.605 m/s^2
+    assert avoidable(20, 7.61, (30, 0, 0, 0.5)) and not avoidable(20, 7.60, (30, 0, 0, 0.5))
+    assert avoidable(0, 0.5, (4.0, -10.0, np.pi / 2, 5.0))  # half a metre in front of an ego that stands
+    assert not avoidable(0.8, 0.5, (3.8, -10.0, np.pi / 2, 5.0))  # 0.3 m before one that rolls 0.6 m
 
 
 def test_avoidable_by_braking_is_what_a_simulation_finds():

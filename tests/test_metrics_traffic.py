@@ -188,9 +188,10 @@ def test_short_records_and_short_headways():
     found, by = run(record([49.0, 46.0, 39.0], 10.0, 13), [(0, 50.0)])
     assert by["flow_per_hour"][0, 0] == pytest.approx(3 * 3600 / 1.2, rel=1e-4)
     assert by["headway_histogram"][0, :3].tolist() == [0.5, 0.5, 0.0]  # bins of half a second
-    found, by = run(record([49.0], 10.0, 9), [(0, 50.0)])
-    assert by["flow_per_hour"][0, 0] == pytest.approx(3600 / 0.8, rel=1e-4)
-    assert found["flow_per_hour"] == pytest.approx(3600 * 8 / (0.8 * TOTAL), rel=1e-4)
+    found, by = run(record([49.0, 46.0], 10.0, 9), [(0, 50.0)])
+    assert by["flow_per_hour"][0, 0] == pytest.approx(2 * 3600 / 0.8, rel=1e-4)
+    assert found["flow_per_hour"] == pytest.approx(3600 * 16 / (0.8 * TOTAL), rel=1e-4)
+    assert by["headway_histogram"][0, 0] == 1.0  # a single one
 
 
 def test_a_lane_change_is_no_passage():

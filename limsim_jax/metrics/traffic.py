@@ -174,14 +174,12 @@ class TrafficMetrics:
             ),
             square_trips=carry.square_trips + jnp.sum(jnp.where(arrived, duration * duration, 0)),
         )
-        carry = self._detect(carry, detectors, step, counts)
+        carry = self._detect(carry, detectors, step)
         return carry._replace(active=step.active, lane=step.lane, s=step.s)
 
-    def _detect(
-        self, carry: TrafficCarry, detectors: Detectors, step: TrafficStep, counts: Bool[Array, ""]
-    ) -> TrafficCarry:
+    def _detect(self, carry: TrafficCarry, detectors: Detectors, step: TrafficStep) -> TrafficCarry:
         """Who has passed which detector. A lane change is no passage; the lane that it leads to counts."""
-        drove = carry.active & (step.active | step.left) & counts
+        drove = carry.active & (step.active | step.left)  # nobody is active before the start
         handed_over = step.left | ((step.lane != carry.lane) & (step.s <= step.dx))
         place, lane = detectors.s[:, None], detectors.lane[:, None]  # [D, 1]
         on_now = (lane == step.lane[None]) & ~step.left[None]
