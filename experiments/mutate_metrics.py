@@ -119,10 +119,10 @@ SAME |= {
 """(module, function, change): why the mutants behave as the original does."""
 
 SWAPS = {
-    ast.Add: ("sign", ast.Sub, "+", "-"),
-    ast.Sub: ("sign", ast.Add, "-", "+"),
-    ast.Mult: ("unit", ast.Div, "*", "/"),
-    ast.Div: ("unit", ast.Mult, "/", "*"),
+    ast.Add: ("sign", ast.Sub),
+    ast.Sub: ("sign", ast.Add),
+    ast.Mult: ("unit", ast.Div),
+    ast.Div: ("unit", ast.Mult),
 }
 COMPARISONS = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
 OPPOSITE = {"min": "max", "minimum": "maximum", "lesser": "greater"}
@@ -166,7 +166,7 @@ def changes(node: ast.AST) -> Iterator[tuple[str, str]]:
     code = ast.unparse
     match node:
         case ast.BinOp(left, operator, right) if type(operator) in SWAPS:
-            kind, other, _, _ = SWAPS[type(operator)]
+            kind, other = SWAPS[type(operator)]
             yield kind, code(ast.BinOp(left, other(), right))
         case ast.BinOp(left, ast.BitAnd() | ast.BitOr(), right):
             yield "mask", code(right)
@@ -302,6 +302,9 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="only those that survived last time")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()
+    for name in ("every", "jobs"):
+        if getattr(options, name) < 1:
+            parser.error(f"--{name} {getattr(options, name)}: at least 1")
     multiprocessing.get_context("forkserver").set_forkserver_preload(
         ["jax", "jax.numpy", "pytest", "scipy.stats", "scipy.signal", "pyarrow"]
     )

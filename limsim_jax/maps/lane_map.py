@@ -203,6 +203,12 @@ def side_s(lane_map: LaneMap, lane: Index, s: Number, side: Index) -> Float[Arra
     return jnp.where(left, start_l, start_r) + u * jnp.where(left, slope_l, slope_r)
 
 
+def room_beside(lane_map: LaneMap, lane: Index, s: Number, side: Index) -> Float[Array, "*#b"]:
+    """m from `s` on `lane` to where its left (`side` > 0) or right neighbour no longer runs beside it."""
+    beside = lane_map.beside_s[lane]
+    return jnp.where(jnp.asarray(side) > 0, beside[..., 0], beside[..., 1]) - _as_float(lane_map, s)
+
+
 def turn_speed(lane_map: LaneMap, lane: Index, lateral_acceleration: Number) -> Float[Array, "*#b"]:
     """Speed (m/s) at which the tightest bend takes this lateral acceleration (m/s^2), at most the limit.
 

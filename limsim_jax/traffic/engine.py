@@ -16,7 +16,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.maps.lane_map import NO_LANE, LaneMap, bend_speed, curvature
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, bend_speed, curvature, room_beside
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.numerics import computed_once, mapped_like
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
@@ -263,9 +263,8 @@ def _speeds(
 
 def _until_changed(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
     """Speed that nobody who changes lanes exceeds, so that it is done before the two lanes part."""
-    beside = lane_map.beside_s[state.lane]
-    left = (state.side > 0) != state.crossed  # where the other lane is
-    room = jnp.where(left, beside[:, 0], beside[:, 1]) - state.s
+    other = jnp.where(state.crossed, -state.side, state.side)  # side of the other lane
+    room = room_beside(lane_map, state.lane, state.s, other)
     time = jnp.maximum(state.driver.lane_change_time * (1 - state.progress), 0.1)
     # who is faster already, as where somebody else has driven it, does not brake for that
     least = jnp.maximum(state.v, CREEP_SPEED)

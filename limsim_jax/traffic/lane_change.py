@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, room_beside, side_s, width
 from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
 from limsim_jax.traffic.motion import CREEP_SPEED
@@ -132,9 +132,8 @@ def place_beside(
     usable = ((lane_map.access[lane] >> state.shape.vehicle_class) & 1) == 1
     allowed &= usable & state.active & (state.side == 0) & ~lane_map.is_connector[state.lane]
     # time to finish before the lanes part
-    beside = lane_map.beside_s[state.lane]
     needed = jnp.maximum(state.v, CREEP_SPEED) * state.driver.lane_change_time
-    allowed &= jnp.where(left, beside[:, 0], beside[:, 1]) - state.s > needed
+    allowed &= room_beside(lane_map, state.lane, state.s, side) > needed
     lane = jnp.where(allowed, lane, NO_LANE)
     return lane, side_s(lane_map, state.lane, state.s, side), allowed
 
