@@ -56,7 +56,7 @@ TESTS = {
     "traffic": ("metrics_traffic",),
     "episode": ("metrics_episode",),
     "intervals": ("metrics_intervals",),
-    "observer": ("episodes",),
+    "observer": ("observer",),
 }
 """The tests of each module, the nearest first."""
 

@@ -18,6 +18,7 @@ from limsim_jax.calibration.closed_loop import (
     drawn,
     evaluate,
     floor,
+    from_own,
     headway,
     hold_out,
     link,
@@ -238,6 +239,28 @@ def test_floor_is_that_of_equal_vehicles():
     assert max(floor(link(same, period=30.0))) < 1e-3
     unlike = [segment(f"{i}", "a", 0, np.full(300, 20.0), 5.0 + i, 5.0 + i) for i in range(8)]
     assert floor(link(unlike, period=30.0)).speed > 0.3
+
+
+def test_a_record_of_its_own_is_as_far_as_other_draws_are(known):
+    part = known.part([0, 2])
+    recorded, chains = samples(part), jax.tree.map(jnp.asarray, part.chains)
+    points = int(recorded.point.max()) + 1
+    root = jnp.asarray(np.diag(SPREAD), jnp.float32)
+    parameters = drawn(jnp.asarray(np.log(TRUTH), jnp.float32), root, scores(4, len(part.drivers), 3))
+    found = from_own(MODEL, parameters, chains, recorded, DT, points)
+    each = [jax.vmap(lambda p, c: simulate(MODEL, p, c, DT))(p[recorded.who], chains) for p in parameters]
+    gap, v = (
+        np.stack([np.asarray(x).reshape(-1)[recorded.at] for x in leaf]) for leaf in zip(*each, strict=True)
+    )
+    times = (np.maximum(gap, 0) + np.asarray(recorded.length_lead)) / np.maximum(v, 1)
+    for name, x in (("speed", v), ("gap", gap), ("headway", np.minimum(times, 10))):
+        apart = [wasserstein_distance(x[k], np.delete(x, k, 0).ravel()) for k in range(4)]
+        assert float(getattr(found, name)) == pytest.approx(np.mean(apart), rel=1e-3), name
+    means = v.mean(1)
+    apart = [abs(means[k] - np.delete(means, k).mean()) for k in range(4)]
+    assert float(found.mean_speed) == pytest.approx(np.mean(apart), abs=1e-4)
+    alike = from_own(MODEL, jnp.broadcast_to(parameters[:1], parameters.shape), chains, recorded, DT, points)
+    assert max(float(x) for x in alike) < 1e-3
 
 
 # --- populations -------------------------------------------------------------------------------------

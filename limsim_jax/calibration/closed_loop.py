@@ -9,7 +9,8 @@ are adjusted until time headways, speeds, gaps and the fundamental diagram have 
 The scores of the drivers are the same whatever the population is (common random numbers), and the distance of
 two distributions is the mean distance of their sorted samples (Wasserstein-1), so the loss has gradients by
 the population, through the rollout. Periods are held out; `ClosedLoop` has the distances there, before and
-after, and how far apart two halves of the recorded vehicles themselves are.
+after, and two yardsticks: how far apart two halves of the recorded vehicles themselves are, and how far a
+record is from a population that made it. Nearer than that no population comes.
 
 What has no gradient is for `matching`.
 """
@@ -375,18 +376,50 @@ def evaluate(
       dt: s.
       points: of the fundamental diagram.
     """
+    gap, v = _at_samples(model, parameters, chains, recorded, dt)
+    return distances(recorded, gap, v, points), jnp.mean((gap <= 0).astype(gap.dtype))
+
+
+def _at_samples(
+    model: CarFollowing, parameters: Float[Array, "K D P"], chains: Chains, recorded: Samples, dt: float
+) -> tuple[Float[Array, "K M"], Float[Array, "K M"]]:
+    """Gaps, m, and speeds, m/s, of simulations where the record is compared."""
     rows = parameters[:, recorded.who]  # [K W V P]
     each = jax.vmap(lambda p, chains: simulate(model, p, chains, dt))
     gap, v = jax.vmap(each, in_axes=(0, None))(rows, chains)
     gap, v = (x.reshape(x.shape[0], -1)[:, recorded.at] for x in (gap, v))
-    return distances(recorded, gap, v, points), jnp.mean((gap <= 0).astype(gap.dtype))
+    return gap, v
+
+
+@partial(jax.jit, static_argnames=("model", "dt", "points"))
+def from_own(
+    model: CarFollowing,
+    parameters: Float[Array, "K D P"],
+    chains: Chains,
+    recorded: Samples,
+    dt: float,
+    points: int,
+) -> Distances:
+    """Distances of a record that the population itself has made from its other simulations, the mean.
+
+    That is what is left when a population is exactly right, since other drivers are drawn each time: of
+    a record of this size and these leaders no population can be expected to come nearer. Arguments as of
+    `evaluate`, `K` >= 2.
+    """
+    gap, v = _at_samples(model, parameters, chains, recorded, dt)
+
+    def one(k: Array) -> Distances:
+        others = jnp.arange(gap.shape[0] - 1)
+        others = jnp.where(others >= k, others + 1, others)
+        made = recorded._replace(gap=gap[k], v=v[k])
+        return distances(made, gap[others], v[others], points)
+
+    found = jax.lax.map(one, jnp.arange(gap.shape[0]))
+    return jax.tree.map(lambda x: jnp.mean(x), found)
 
 
 def floor(linked: Linked, splits: int = 8, seed: int = 0) -> Distances:
-    """Distances between two halves of the recorded drivers, the mean over random splits.
-
-    No population can be expected to come much nearer.
-    """
+    """Distances between two halves of the recorded drivers, the mean over random splits."""
     rng = np.random.default_rng(seed)
     recorded = samples(linked)
     points = int(recorded.point.max()) + 1
@@ -498,6 +531,7 @@ class ClosedLoop:
     fitted: dict[str, Distances]  # of the periods of the fit
     held_out: dict[str, Distances]
     floors: tuple[Distances, Distances]  # between halves of the recorded drivers, in both
+    from_own: tuple[Distances, Distances]  # of records made by the adjusted population from it, in both
     overlaps: dict[str, float]  # share of the samples held out in which bodies overlap
     samples: tuple[int, int]
     losses: Floats  # of every iteration
@@ -522,6 +556,7 @@ class ClosedLoop:
             "fitted": {name: plain(x) for name, x in self.fitted.items()},
             "held_out": {name: plain(x) for name, x in self.held_out.items()},
             "floor": {"fitted": plain(self.floors[0]), "held_out": plain(self.floors[1])},
+            "from_own": {"fitted": plain(self.from_own[0]), "held_out": plain(self.from_own[1])},
             "left_of_default": self.falls(),
             "overlaps": self.overlaps,
             "population": {
@@ -539,12 +574,13 @@ class ClosedLoop:
             f"{len(self.periods[1])} held out ({self.samples[0]} and {self.samples[1]} samples)",
             f"{'':34}" + "".join(f"{f'{name}, {UNITS[name]}':>18}" for name in Distances._fields),
         ]
-        for where, found, least in (
-            ("fitted", self.fitted, self.floors[0]),
-            ("held out", self.held_out, self.floors[1]),
+        for where, found, least, own in (
+            ("fitted", self.fitted, self.floors[0], self.from_own[0]),
+            ("held out", self.held_out, self.floors[1], self.from_own[1]),
         ):
             rows = [("default drivers", found["default"]), ("fits of single drivers", found["start"])]
             rows += [("closed loop", found["closed_loop"]), ("between halves of the record", least)]
+            rows += [("of a record of its own", own)]
             for name, row in rows:
                 lines.append(f"{f'{where}, {name}':38}" + "".join(f"{float(x):>16.3f}  " for x in row)[4:])
         left = ", ".join(f"{name} {share:.0%}" for name, share in self.falls().items())
@@ -673,10 +709,12 @@ def calibrate_closed_loop(
         {name: evaluate(drive, p, chains, log, linked.dt, n) for name, p in drivers.items()}
         for chains, log, n in zip(fields, recorded, points, strict=True)
     ]
+    own = [
+        from_own(drive, drivers["closed_loop"], chains, log, linked.dt, n)
+        for chains, log, n in zip(fields, recorded, points, strict=True)
+    ]
     factor = np.asarray(after[1], float)
-    fitted, held_out = (
-        {name: Distances(*(float(x) for x in row[0])) for name, row in part.items()} for part in found
-    )
+    fitted, held_out = ({name: _on_host(row[0]) for name, row in part.items()} for part in found)
     law = replace(start, mean=np.asarray(after[0], float), covariance=factor @ factor.T, model=model)
     return ClosedLoop(
         law=law,
@@ -687,11 +725,16 @@ def calibrate_closed_loop(
         fitted=fitted,
         held_out=held_out,
         floors=(floor(parts[0]), floor(parts[1])),
+        from_own=(_on_host(own[0]), _on_host(own[1])),
         overlaps={name: float(row[1]) for name, row in found[1].items()},
         samples=(len(recorded[0].at), len(recorded[1].at)),
         losses=np.asarray(losses, float),
         seconds=time.perf_counter() - begin,
     )
+
+
+def _on_host(found: Distances) -> Distances:
+    return Distances(*(float(x) for x in found))
 
 
 def _scale(recorded: Samples, weights: Mapping[str, float]) -> Array:
@@ -715,6 +758,7 @@ __all__ = [
     "drawn",
     "evaluate",
     "floor",
+    "from_own",
     "headway",
     "hold_out",
     "link",

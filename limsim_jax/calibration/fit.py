@@ -475,7 +475,8 @@ def fit(
       method: see the module.
       starts: descents per driver, each from the best of 32 quasi-random points; not for "de". Default: 8
         with the IDM, 16 with the others, whose kinks give them more local minima.
-      iterations: at most; of "de" generations. Default: 25 (lm), 60 (lbfgs), 300 (adam), 100 (de).
+      iterations: at most, from the best start; of "de" generations. Default: 80 (lm), 60 (lbfgs), 300
+        (adam), 100 (de).
       seed: of the random points.
       samples: see `stack`.
 
@@ -535,14 +536,20 @@ def solve(
     costs = _screen(problem, points, data).reshape(count, starts, 32)
     u = points.reshape(starts, 32, size)[jnp.arange(starts)[None], jnp.argmin(costs, axis=-1)]
     if method == "lm":
-        # All starts a little way, the best few of them to the end; in parts of one shape.
+        # All starts a little way, the best few of them further, the best alone to the end: valleys are long
+        # and narrow where parameters are hardly identified. In parts of one shape.
         few = max(starts // 4, 2)
         parts = [u[:, k : k + few] for k in range(0, starts, few) if k + few <= starts or k == 0]
         parts = [_levenberg_marquardt(problem, part, data, None, 5, 1e-3) for part in parts]
         u, costs = (jnp.concatenate(leaves, axis=1) for leaves in zip(*parts, strict=True))
         best = jnp.argsort(costs, axis=-1)[:, :few]
         u = jnp.take_along_axis(u, best[..., None], axis=1)
-        u, costs = _levenberg_marquardt(problem, u, data, None, iterations or 25, 1e-5)
+        u, costs = _levenberg_marquardt(problem, u, data, None, min(iterations or 15, 15), 1e-5)
+        row, best = jnp.arange(count), jnp.argmin(costs, axis=-1)
+        alone, least = _levenberg_marquardt(
+            problem, u[row, best][:, None], data, None, iterations or 80, 1e-5
+        )
+        u, costs = u.at[row, best].set(alone[:, 0]), costs.at[row, best].set(least[:, 0])
     else:
         theta, costs = _descend(
             problem, jnp.log(u / (1 - u)), data, iterations or (60 if method == "lbfgs" else 300), method

@@ -1,0 +1,651 @@
+"""What the metrics are shown of a world, against loops in NumPy over one vehicle and one lane at a time.
+
+Worlds are drawn at random, also such as hardly occur, on a crossing with lights, stop signs on some
+connectors and some lanes lifted to bridges. What other modules say of bodies and lanes is taken for given.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from traffic_worlds import bundled, drivers, shapes
+
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, elevation, pose, width
+from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.metrics.observer import EvaluateEgo, Look, _meets_ego
+from limsim_jax.metrics.safety import NO_GAP
+from limsim_jax.metrics.traffic import TrafficMetrics, TrafficStep
+from limsim_jax.traffic.collision import off_road
+from limsim_jax.traffic.demand import start_state
+from limsim_jax.traffic.engine import Command, Tick
+from limsim_jax.traffic.motion import Decision, boxes
+from limsim_jax.traffic.neighbors import Obstacles, other_lane
+from limsim_jax.types import Config, Egos, Shape, State, Status
+
+CONFIG = Config(dt=0.1)
+N, WORLDS, STORIES, STEPS = 14, 400, 16, 8
+
+
+@functools.cache
+def crossing() -> LaneMap:
+    """The bundled crossing with lights, where some connectors have stop signs and some lanes are bridges."""
+    lane_map = bundled("intersection")[1]
+    rng = np.random.default_rng(1)
+    table, rows = lane_map.conflicts, lane_map.conflicts.lane.shape[0]
+    signs = rng.random(rows) < 0.5
+    signs[-1] = False  # the null row
+    height = np.array(lane_map.height)
+    for lane in np.nonzero(np.asarray(lane_map.valid) & (rng.random(lane_map.length.shape[0]) < 0.15))[0]:
+        first = int(lane_map.first[lane])
+        height[first : first + int(lane_map.count[lane]), 0] += 8.0
+    stop_s = lane_map.length - jnp.asarray(rng.uniform(0, 3, lane_map.length.shape), jnp.float32)
+    return dataclasses.replace(
+        lane_map,
+        stop_s=jnp.where(lane_map.valid, stop_s, lane_map.stop_s),
+        height=jnp.asarray(height),
+        conflicts=dataclasses.replace(table, must_stop=jnp.asarray(signs)),
+    )
+
+
+@functools.cache
+def host() -> LaneMap:
+    """The same map in NumPy."""
+    return jax.tree.map(np.asarray, crossing())
+
+
+def f32(x) -> Any:
+    return np.asarray(x, np.float32)
+
+
+def i32(x) -> Any:
+    return np.asarray(x, np.int32)
+
+
+def around(rng, lane: int, goals) -> int:
+    """A lane that has to do with this one."""
+    m = host()
+    table = m.conflicts
+    kind = rng.integers(8)
+    if kind == 0 and table.connector[lane] >= 0:
+        foes = table.foe[table.connector[lane]]
+        foes = foes[foes >= 0]
+        return int(table.lane[rng.choice(foes)]) if foes.size else lane
+    if kind == 1:
+        return int(rng.choice(m.predecessors[lane]))
+    if kind == 2:
+        return int(rng.choice(m.successors[lane]))
+    if kind == 3:
+        following = int(m.routes.next_lane[lane, rng.choice(goals)])
+        row = table.connector[following] if following != NO_LANE else -1
+        foes = table.foe[row] if row >= 0 else np.array([-1])
+        foes = foes[foes >= 0]
+        return int(table.lane[rng.choice(foes)]) if foes.size else following
+    if kind == 4:
+        return int(m.left[m.left[lane]]) if rng.random() < 0.5 else int(m.right[m.right[lane]])
+    return [lane, int(m.left[lane]), int(m.right[lane])][rng.integers(3)]
+
+
+@functools.cache
+def blank() -> State:
+    """Nobody anywhere."""
+    nothing = np.zeros(N, np.float32)
+    state = start_state(
+        crossing(), drivers(N), shapes(N), lane=np.full(N, NO_LANE), s=nothing, v=nothing, goal=i32(nothing)
+    )
+    return jax.tree.map(np.asarray, state)
+
+
+def random_state(rng, slot: int, lane: int | None = None) -> State:
+    """Vehicles anywhere near the ego in `slot`, in any condition."""
+    m = host()
+    lanes = np.nonzero(m.valid)[0]
+    goals = np.arange(m.routes.next_lane.shape[1])
+    if lane is None:
+        ends, inside = lanes[m.routes.is_goal[lanes].any(1)], lanes[m.is_connector[lanes]]
+        lane = int(rng.choice([ends, inside, lanes, lanes][rng.integers(4)]))
+    on = np.array([around(rng, lane, goals) for _ in range(N)])
+    on[slot] = lane if rng.random() < 0.93 else NO_LANE
+    length = m.length[on]
+    places = [rng.uniform(0, 1.5, N), rng.uniform(-2, length + 2), length - rng.uniform(-8, 20, N)]
+    s = np.where(rng.random(N) < 0.3, places[0], np.where(rng.random(N) < 0.5, places[1], places[2]))
+    before = np.where(rng.random(N) < 0.7, m.predecessors[on, 0], NO_LANE)
+    active = rng.random(N) < 0.85
+    # what matters most at an ego: it has just entered a connector, or is at the end of its goal
+    if m.is_connector[on[slot]] and rng.random() < 0.6:
+        s[slot], before[slot] = rng.uniform(0, 1.5), m.predecessors[on[slot], 0]
+    elif m.routes.is_goal[on[slot]].any() and rng.random() < 0.5:
+        s[slot] = length[slot] + rng.uniform(-1, 2)
+    goal = rng.choice(goals, N)
+    ways = [g for g in goals if on[slot] != NO_LANE and m.routes.reachable[on[slot], g]]
+    if ways and rng.random() < 0.9:
+        goal[slot] = rng.choice(ways)
+    status = sum(int(bit) * rng.integers(0, 2, N) for bit in Status)
+    shape = Shape(
+        length=f32(rng.uniform(2, 12, N)),
+        width=f32(rng.uniform(1.0, 2.6, N)),
+        wheelbase=f32(rng.uniform(1.5, 6, N)),
+        vehicle_class=i32(np.zeros(N)),
+    )
+    driver = dataclasses.replace(
+        blank().driver, b_max=f32(rng.uniform(5, 9, N)), v_max=f32(rng.uniform(10, 60, N))
+    )
+    second = (slot + 1 + rng.integers(N - 1)) % N
+    phases = (m.signals.duration > 0).sum(1)
+    return dataclasses.replace(
+        blank(),
+        driver=driver,
+        shape=shape,
+        active=active,
+        lane=i32(on),
+        previous=i32(before),
+        s=f32(s),
+        v=f32(rng.choice([0.0, 1, 12], N) * rng.random(N)),
+        goal=i32(goal),
+        d=f32(rng.uniform(-2, 2, N)),
+        a=f32(rng.uniform(-4, 2, N)),
+        side=i32(rng.choice([-1, 0, 0, 1], N)),
+        crossed=rng.random(N) < 0.5,
+        progress=f32(rng.random(N)),
+        shift=f32(rng.uniform(-3, 3, N)),
+        stopped=rng.random(N) < 0.3,
+        entered=f32(rng.uniform(0, 20, N)),
+        status=i32(status),
+        lights=dataclasses.replace(blank().lights, phase=i32(rng.integers(0, np.maximum(phases, 1)))),
+        egos=Egos(
+            slot=i32([slot, second]),
+            free=rng.random(2) < 0.3,
+            **{name: f32(rng.uniform(-3, 3, 2)) for name in ("x", "y", "heading", "steering", "a")},
+        ),
+    )
+
+
+def random_tick(rng, slot: int, lane: int | None = None) -> Tick:
+    """A physics step that may have led to a random state, with leaders and ways to come."""
+    state = random_state(rng, slot, lane)
+    other = rng.integers(-1, N, (N, 3))
+    gap = np.where(other < 0, NO_GAP, rng.uniform(-3, 40, (N, 3)))
+    lanes = np.asarray(state.lane)
+    way = np.stack([lanes, host().routes.next_lane[lanes, np.asarray(state.goal)]], -1)
+    way[lanes == NO_LANE] = NO_LANE
+    decision = Decision(
+        obstacles=Obstacles(i32(other), f32(gap)),
+        v0=f32(rng.uniform(3, 20, N)), v_ahead=f32(rng.uniform(3, 20, N)), ahead=f32(rng.uniform(0, 99, N)),
+        courtesy=i32(np.full(N, -1)), courtesy_gap=f32(np.zeros(N)),
+        way=i32(way),
+    )  # fmt: skip
+    return Tick(
+        state=state,
+        left=rng.random(N) < 0.2,
+        off_road=rng.random(N) < 0.2,
+        time=f32(rng.uniform(0, 99)),
+        decision=decision,
+        x=f32(rng.uniform(0, 6, N)),
+        dx=f32(np.where(rng.random(N) < 0.15, 0.0, rng.uniform(0, 4, N))),
+        command=Command(),
+    )
+
+
+@functools.cache
+def seen() -> list[tuple[Tick, Look]]:
+    """Random steps and what is seen of them, in NumPy."""
+    rng = np.random.default_rng(3)
+    ticks = [random_tick(rng, int(rng.integers(N))) for _ in range(WORLDS)]
+    return list(zip(ticks, looks_at(ticks), strict=True))
+
+
+@jax.jit
+def _looks(lane_map, ticks):
+    return jax.vmap(lambda tick: EvaluateEgo().look(CONFIG, lane_map, tick))(ticks)
+
+
+def looks_at(ticks):
+    size = 50  # of a batch: one program
+    parts = []
+    for begin in range(0, len(ticks), size):
+        part = ticks[begin : begin + size]
+        looks = jax.tree.map(np.asarray, _looks(crossing(), stacked(part + part[:1] * (size - len(part)))))
+        parts += [jax.tree.map(lambda x: x[i], looks) for i in range(len(part))]  # noqa: B023
+    return parts
+
+
+def stacked(trees):
+    return jax.tree.map(lambda *x: np.stack(x), *trees)
+
+
+@functools.cache
+def given():
+    """Of all random steps, from other modules: bodies, levels, widths, second lanes, headings, who is off."""
+    state = stacked([tick.state for tick, _ in seen()])
+    places = [centre(tick.state, int(tick.state.egos.slot[0])) for tick, _ in seen()]
+
+    @jax.jit
+    @jax.vmap
+    def ask(state, lane, s):
+        m = crossing()
+        z = elevation(m, state.lane, state.s)[0]
+        box = boxes(m, state)
+        wide, other = width(m, state.lane, state.s), other_lane(m, state)[0]
+        return box, z, wide, other, pose(m, lane, s)[2], off_road(m, state, box)
+
+    told = ask(state, i32([lane for lane, _ in places]), f32([s for _, s in places]))
+    return [jax.tree.map(lambda x: x[i], jax.tree.map(np.asarray, told)) for i in range(WORLDS)]  # noqa: B023
+
+
+def each(name: str):
+    """The step, what is said of the ego under a name, and the number, for all random steps."""
+    for i, (tick, look) in enumerate(seen()):
+        yield i, tick.state, tick, int(tick.state.egos.slot[0]), getattr(look.ego, name)
+
+
+def test_plain_columns_are_those_of_the_state():
+    for i, (tick, look) in enumerate(seen()):
+        state, slot = tick.state, int(tick.state.egos.slot[0])
+        ego, traffic = look.ego, look.traffic
+        assert ego.t == tick.time == traffic.t
+        assert ego.slot == slot and ego.v == state.v[slot] and ego.a == state.a[slot]
+        assert ego.rear_axle == pytest.approx(0.5 * state.shape.wheelbase[slot])
+        np.testing.assert_array_equal(ego.b_max, state.driver.b_max)
+        for name in ("active", "lane", "s", "v", "entered"):
+            np.testing.assert_array_equal(getattr(traffic, name), getattr(state, name))
+        np.testing.assert_array_equal(traffic.dx, tick.dx)
+        np.testing.assert_array_equal(traffic.v_free, tick.decision.v0)
+        np.testing.assert_array_equal(traffic.left, tick.left)
+        assert traffic.inside.all() and not traffic.changed.any()
+        np.testing.assert_array_equal(look.way, tick.decision.way)
+        np.testing.assert_array_equal(look.other, given()[i][3])
+        assert look.stopped == state.stopped[slot] and ego.off_road == tick.off_road[slot]
+
+
+def test_bodies_and_who_is_on_the_same_level():
+    there = 0
+    for i, (tick, look) in enumerate(seen()):
+        box, z, *_ = given()[i]
+        state, slot = tick.state, int(tick.state.egos.slot[0])
+        np.testing.assert_allclose(look.ego.box, box, atol=1e-4)
+        for k in range(N):
+            v = state.v[k] * np.array([np.cos(box[k, 2]), np.sin(box[k, 2])])
+            np.testing.assert_allclose(look.ego.velocity[k], v, atol=1e-4)
+            assert look.ego.active[k] == (state.active[k] and abs(z[k] - z[slot]) < 3.0)
+            there += state.active[k] and not look.ego.active[k]
+    assert there > 100
+
+
+def test_who_drives_where_others_have_priority():
+    for _, state, _, _, found in each("violation"):
+        for k in range(N):
+            inside = state.lane[k] != NO_LANE and host().junction[state.lane[k]] >= 0
+            red = Status.RED_LIGHT in Status(int(state.status[k]))
+            assert found[k] == ((red and inside) or Status.WRONG_WAY in Status(int(state.status[k])))
+
+
+def test_who_is_in_several_lanes():
+    for i, state, tick, _, found in each("changing"):
+        for k in range(N):
+            left, right = state.d[k] + state.shape.width[k] / 2, state.d[k] - state.shape.width[k] / 2
+            half = given()[i][2][k] / 2
+            assert found[k] == (state.side[k] != 0 or left > half or right < -half or tick.off_road[k])
+
+
+def test_the_leader_has_moved_since_the_decision():
+    ahead = 0
+    for i, state, tick, slot, found in each("lead"):
+        other, gap = (x[slot, 0] for x in tick.decision.obstacles)
+        if other < 0 or not state.active[other]:
+            assert found == -1 and seen()[i][1].ego.lead_gap == NO_GAP
+        else:
+            expected = max(gap + tick.x[other] - tick.x[slot], 0)
+            assert found == other and seen()[i][1].ego.lead_gap == pytest.approx(expected, abs=1e-5)
+            ahead += expected > 0
+    assert ahead > 50
+
+
+def centre(state, slot):
+    """Lane and s of the middle of the ego."""
+    s, lane = state.s[slot] - state.shape.length[slot] / 2, state.lane[slot]
+    if s < 0 and state.previous[slot] != NO_LANE:
+        lane = state.previous[slot]
+        s = s + host().length[lane]
+    return lane, s
+
+
+def test_the_road_under_the_ego():
+    for i, state, _, slot, found in each("lane_heading"):
+        lane, _ = centre(state, slot)
+        ego = seen()[i][1].ego
+        assert found == pytest.approx(given()[i][4], abs=1e-4)
+        on = state.lane[slot] != NO_LANE
+        assert ego.on_lane == on == ego.on_route
+        assert ego.in_junction == (lane != NO_LANE and host().junction[lane] >= 0)
+        if on:
+            assert ego.speed_limit == host().speed_limit[state.lane[slot]]
+            goal = host().routes.is_goal[state.lane[slot], state.goal[slot]]
+            beyond = state.s[slot] > host().length[state.lane[slot]]
+            assert ego.arrived == (goal and beyond and state.active[slot])
+    assert sum(found for *_, found in each("arrived")) > 3
+
+
+def entered(state, tick, slot):
+    return state.active[slot] and state.previous[slot] != NO_LANE and 0 < tick.dx[slot] >= state.s[slot]
+
+
+def shows(state):
+    return np.asarray(lane_states(crossing().signals, jnp.asarray(state.lights.phase)))
+
+
+def test_crossing_a_stop_line_on_red():
+    told = []
+    for _, state, tick, slot, found in each("red_light"):
+        expected = False
+        if entered(state, tick, slot):
+            before = state.previous[slot]
+            was = host().length[before] + state.s[slot] - tick.dx[slot]  # on that lane, a step ago
+            crossed = was <= host().stop_s[before] + 0.5
+            expected = crossed and shows(state)[state.lane[slot]] == SignalState.RED
+            told.append((expected, crossed))
+        assert found == expected
+    assert 3 < sum(red for red, _ in told) < sum(crossed for _, crossed in told) < len(told)
+
+
+def test_passing_a_stop_sign():
+    passed = 0
+    for _, state, tick, slot, found in each("stop_sign"):
+        row = host().conflicts.connector[state.lane[slot]]
+        assert found == (entered(state, tick, slot) and row >= 0 and host().conflicts.must_stop[row])
+        passed += found
+    assert passed > 5
+
+
+def test_waiting_at_red():
+    waits = []
+    for _, state, _, slot, found in each("waits_at_red"):
+        lane = state.lane[slot]
+        following = host().routes.next_lane[lane, state.goal[slot]] if lane != NO_LANE else NO_LANE
+        red = following != NO_LANE and shows(state)[following] == SignalState.RED
+        near = host().stop_s[lane] - state.s[slot] < 15
+        assert found == (red and near and state.v[slot] < 0.5)
+        waits += [(found, red and near and state.v[slot] < 1.8, red and state.v[slot] < 0.5)]
+    found, slower, further = (sum(x) for x in zip(*waits, strict=True))
+    assert found > 5 and slower > found and further > found
+
+
+def test_how_fast_the_others_around_the_ego_are():
+    several = 0
+    for i, state, _, slot, found in each("v_others"):
+        m, z = host(), given()[i][1]
+        lane = state.lane[slot]
+        near = set()
+        if lane != NO_LANE:
+            left, right = m.left[lane], m.right[lane]
+            near = {lane, left, right, m.routes.next_lane[lane, state.goal[slot]]}
+            near |= {m.left[left] if left != NO_LANE else NO_LANE}
+            near |= {m.right[right] if right != NO_LANE else NO_LANE}
+        speeds = [
+            state.v[k]
+            for k in range(N)
+            if k != slot and state.active[k] and state.lane[k] in near - {NO_LANE} and abs(z[k] - z[slot]) < 3
+        ]
+        assert seen()[i][1].ego.others == bool(speeds)
+        assert found == pytest.approx(np.mean(speeds) if speeds else 0.0, abs=1e-5)
+        several += len(speeds) > 1
+    assert several > 100
+
+
+def parts(state, k):
+    """The two lanes that a vehicle may be on, and its front bumper along each."""
+    before = state.previous[k]
+    tail = [(before, state.s[k] + host().length[before])] if before != NO_LANE else []
+    return [*([(state.lane[k], state.s[k])] if state.lane[k] != NO_LANE else []), *tail]
+
+
+def test_conflict_zones_and_who_is_in_them():
+    table = host().conflicts
+    count = table.foe.shape[1]
+    totals = np.zeros(3, int)
+    for _, state, _, slot, found in each("zones"):
+        lane = state.lane[slot]
+        following = host().routes.next_lane[lane, state.goal[slot]] if lane != NO_LANE else NO_LANE
+        expected = {}
+        for at in {state.previous[slot], lane, following} - {NO_LANE}:
+            row = table.connector[at]
+            for c in range(count) if row >= 0 else ():
+                foe = table.foe[row, c]
+                if foe < 0:
+                    continue
+                front = dict(parts(state, slot)).get(at, -1.0)
+                long = state.shape.length[slot]
+                mine = front > table.s_in[row, c] and front - long < table.s_out[row, c]
+                theirs = any(
+                    on == table.lane[foe]
+                    and front > table.f_in[row, c]
+                    and front - state.shape.length[k] < table.f_out[row, c]
+                    for k in range(N)
+                    if k != slot and state.active[k]
+                    for on, front in parts(state, k)
+                )
+                expected[row * count + c] = (mine, theirs)
+        got = {int(z): (bool(e), bool(o)) for z, e, o in zip(*found, strict=True) if z >= 0}
+        if len({state.previous[slot], lane, following} - {NO_LANE}) == 3:  # not twice the same
+            assert got == expected
+            totals += [len(got), sum(e for e, _ in got.values()), sum(o for _, o in got.values())]
+        absent = found.id < 0
+        assert not found.ego[absent].any() and not found.other[absent].any()
+    assert (totals > [300, 30, 30]).all()
+
+
+def test_a_map_where_paths_never_meet():
+    m = crossing()
+    table = dataclasses.replace(
+        m.conflicts,
+        **{n: getattr(m.conflicts, n)[:, :0] for n in "foe s_in s_out f_in f_out type prio tie".split()},
+    )
+    tick = jax.tree.map(jnp.asarray, seen()[0][0])
+    zones = EvaluateEgo().look(CONFIG, dataclasses.replace(m, conflicts=table), tick).ego.zones
+    assert (np.asarray(zones.id) == -1).all() and not np.any(zones.ego) and not np.any(zones.other)
+
+
+def test_who_is_off_the_road_is_looked_for_where_the_engine_did_not():
+    look = jax.jit(lambda tick: EvaluateEgo().look(CONFIG, crossing(), tick._replace(off_road=None)))
+    found = []
+    for (tick, _), (*_, off) in zip(seen()[:25], given()[:25], strict=True):
+        ego = look(tick).ego
+        found += [bool(ego.off_road)]
+        assert ego.off_road == off[tick.state.egos.slot[0]]
+        assert np.asarray(ego.changing)[off].all()
+    assert 0 < sum(found) < 25
+
+
+# --- with a memory -----------------------------------------------------------------------------------
+
+
+def test_whose_way_may_meet_that_of_the_ego():
+    rng = np.random.default_rng(4)
+    table = host().conflicts
+    meets = jax.jit(_meets_ego)
+    shares = []
+    for _ in range(60):
+        slot = int(rng.integers(N))
+        tick = random_tick(rng, slot)
+        way = np.array(tick.decision.way)
+        other = np.where(rng.random(N) < 0.3, rng.choice(way.ravel(), N), NO_LANE)
+        found = np.asarray(
+            meets(crossing(), jnp.int32(slot), jnp.asarray(way), jnp.asarray(other, jnp.int32))
+        )
+        mine = {*way[slot], other[slot]} - {NO_LANE}
+        rows = [table.connector[lane] for lane in mine if table.connector[lane] >= 0]
+        foes = {table.lane[foe] for row in rows for foe in table.foe[row] if foe >= 0}
+        for k in range(N):
+            assert found[k] == bool(({*way[k], other[k]} - {NO_LANE}) & (mine | foes))
+        shares.append(found.mean())
+    assert 0.2 < np.mean(shares) < 0.95
+
+
+class Recorder:
+    """Keeps what a judge is shown."""
+
+    def __init__(self, judge: Any = None) -> None:
+        self.judge, self.shown = judge, []
+
+    def init(self, *sizes: int):
+        self.sizes = sizes
+        return self.judge and self.judge.init(*sizes)
+
+    def update(self, carry, *shown):
+        self.shown.append(jax.tree.map(np.asarray, shown[-1]))
+        return self.judge and self.judge.update(carry, *shown)
+
+    def result(self, carry, *area):
+        return self.judge.result(carry, *area) if self.judge else {"told": carry}
+
+
+class Seats:
+    """Remembers who was where, which is all that is asked of the traffic's judge."""
+
+    def init(self, slots: int, _: int) -> TrafficStep:
+        return self.update(None, None, stories()[0][2][0].traffic._replace(active=np.zeros(slots, bool)))
+
+    def update(self, _, __, step: TrafficStep) -> TrafficStep:
+        return step
+
+
+class Watched(EvaluateEgo):
+    def judge(self, ego, traffic):
+        object.__setattr__(self, "pair", (ego, traffic))
+        return self
+
+    def _judges(self, config):
+        return self.pair
+
+
+@functools.cache
+def stories():
+    """Steps of one ego in a row: it stays, goes on, changes lanes, gets lost, and another takes its slot."""
+    rng = np.random.default_rng(6)
+    told = []
+    for _ in range(STORIES):
+        m, slot = host(), int(rng.integers(N))
+        lane, ticks = None, []
+        ends = np.nonzero(m.routes.is_goal.any(1))[0]
+        lane = int(rng.choice(ends)) if rng.random() < 0.5 else None
+        for _ in range(STEPS):
+            tick = random_tick(rng, slot, lane)
+            state = tick.state
+            at = int(state.lane[slot])
+            if ticks:
+                # most keep their goal and lane
+                goal = np.where(rng.random(N) < 0.8, ticks[-1].state.goal, state.goal)
+                lanes = np.where(rng.random(N) < 0.6, ticks[-1].state.lane, state.lane)
+                lanes[slot] = at
+                state = dataclasses.replace(state, goal=i32(goal), lane=i32(lanes))
+                tick = tick._replace(state=state)
+            ticks.append(tick)
+            if at != NO_LANE:
+                following = int(m.routes.next_lane[at, int(state.goal[slot])])
+                goes_on = following if following != NO_LANE else at
+                lane = [at, at, goes_on, None][rng.integers(4)]
+        told.append((slot, ticks, looks_at(ticks)))
+    return told
+
+
+def play(slot, ticks, looks, judge):
+    """What the judges were shown: at the start, and over two decisions of the rest."""
+    ego, traffic = Recorder(), Recorder(judge)
+    watch = Watched().judge(ego, traffic)
+    with jax.disable_jit():
+        carry = watch.init(CONFIG, crossing(), jax.tree.map(jnp.asarray, ticks[0].state))
+        carries = [carry]
+        half = len(looks) // 2
+        for part in (looks[:half], looks[half:]):
+            together = jax.tree.map(jnp.asarray, stacked(part))
+            carry = watch.update(CONFIG, crossing(), carry, together)
+            carries.append(carry)
+    return carries, ego, traffic
+
+
+def test_progress_arrival_and_signs_over_time():
+    m = host()
+    totals = dict.fromkeys(("arrived", "left", "lost", "signs", "pardoned", "changed", "new goal"), 0)
+    for slot, ticks, looks in stories():
+        carries, ego, traffic = play(slot, ticks, looks, Seats())
+        start = ticks[0].state
+        goal = start.goal[slot]
+        was, stopped, to_go = start.lane[slot], False, 0.0
+        before = None
+        assert len(ego.shown) == len(looks) + 1
+        for t, step in enumerate(ego.shown):
+            flow = traffic.shown[t]
+            if t == 0:  # the start: nobody has moved or left
+                state, left, dx = start, np.zeros(N, bool), np.zeros(N)
+                assert step.t == 0 and not step.red_light and not step.off_road and not flow.left.any()
+                assert not step.stop_sign
+                np.testing.assert_array_equal(step.relevant, True)
+            else:
+                tick, look = ticks[t - 1], looks[t - 1]
+                state, left, dx = tick.state, tick.left, tick.dx
+            lane, s = state.lane[slot], state.s[slot]
+            on_route = bool(m.routes.reachable[lane, goal]) if lane != NO_LANE else False
+            leaves = bool(left[slot] and was != NO_LANE and m.routes.is_goal[was, goal])
+            passed = lane != NO_LANE and s > m.length[lane] and state.active[slot]
+            passed = passed and m.routes.is_goal[lane, state.goal[slot]]
+            reached = bool(passed and m.routes.is_goal[lane, goal])
+            if on_route:
+                to_go = m.routes.distance[lane, goal] - s
+            if leaves or reached:
+                to_go = 0.0
+            assert step.on_route == on_route and step.arrived == (leaves or reached)
+            assert step.to_go == pytest.approx(to_go, rel=1e-5, abs=1e-4)
+            if t:
+                assert step.stop_sign == (look.ego.stop_sign and not stopped)
+                totals["signs"] += bool(step.stop_sign)
+                totals["pardoned"] += bool(look.ego.stop_sign and stopped)
+            stopped = bool(state.stopped[slot]) or (stopped and lane == was)
+            for k in range(N) if before is not None else ():
+                both = state.active[k] and before.active[k] and state.lane[k] != before.lane[k]
+                assert flow.changed[k] == (both and state.s[k] > dx[k])
+                totals["changed"] += bool(flow.changed[k])
+            totals["arrived"] += reached
+            totals["left"] += leaves
+            totals["lost"] += lane == NO_LANE
+            totals["new goal"] += bool(passed and not reached)
+            if lane != NO_LANE:
+                was = lane
+            before = state
+            half = len(looks) // 2
+            index = {0: 0, half: 1, len(looks): 2}.get(t)
+            if index is not None:
+                found = carries[index]
+                assert found.goal == goal and found.lane == was and bool(found.stopped) == stopped
+                assert found.to_go == pytest.approx(to_go, rel=1e-5, abs=1e-4)
+        for number, begin in ((1, 1), (2, half + 1)):
+            first = looks[begin - 1]
+            end = half if number == 1 else len(looks)
+            other = np.max([look.other for look in looks[begin - 1 : end]], 0)
+            expected = _meets_ego(
+                crossing(), jnp.int32(slot), jnp.asarray(first.way), jnp.asarray(other, jnp.int32)
+            )
+            for t in range(begin, end + 1):
+                np.testing.assert_array_equal(ego.shown[t].relevant, expected)
+    assert min(totals.values()) > 0, totals
+
+
+def test_the_judges_get_the_time_step_and_as_many_slots_as_there_are():
+    slot, ticks, looks = stories()[0]
+    _, ego, traffic = play(slot, ticks, looks, Seats())
+    assert ego.sizes == (N, looks[0].ego.zones.id.size) and traffic.sizes == (N, 0)
+    judges = EvaluateEgo()._judges(Config(dt=0.05))
+    assert [judge.dt for judge in judges] == [0.05, 0.05]
+
+
+def test_density_is_over_the_length_of_all_lanes():
+    slot, ticks, looks = stories()[0]
+    carries, _, traffic = play(slot, ticks, looks, TrafficMetrics(CONFIG.dt))
+    found = Watched().judge(Recorder(), traffic).result(CONFIG, crossing(), carries[-1])
+    total = sum(float(x) for x, valid in zip(host().length, host().valid, strict=True) if valid)
+    given = traffic.result(carries[-1].traffic, jnp.float32(total))
+    assert set(found) == {"told"} | {f"traffic_{name}" for name in given}
+    assert float(found["traffic_density_per_km"].value) > 0
+    for name, value in given.items():
+        assert float(found[f"traffic_{name}"].value) == pytest.approx(float(value.value), rel=1e-5), name
