@@ -43,6 +43,7 @@ SOURCES: dict[str, dict[str, Any]] = {
         "title": "NGSIM I-80, human, congested",
         "speed_limit": 29.0,  # 65 mph
     },
+    "tgsim": {"title": "TGSIM, human"},
     "openacc-acc": {"title": "OpenACC platoons, ACC", "period": 100.0},
     "openacc-human": {
         "title": "OpenACC platoons, human",
@@ -203,8 +204,8 @@ def table(found: dict[str, Any]) -> str:
             "of mean speeds, and of flows at equal densities (Edie). Drivers drawn from: the simulator's",
             "default population, the population of fits to single drivers, and that one adjusted in closed",
             "loop. *Halves*: between two halves of the recorded drivers. *Own record*: of a record that this",
-            "population has made itself, with other draws of its drivers; nearer than that no population can",
-            "be expected to come. Periods held out come after those of the fit (US-101: other scenes).",
+            "population has made itself, with other draws of its drivers; as far is one that is exactly",
+            "right. Periods held out come after those of the fit (US-101: other scenes).",
             "ACC-IDM, the model of the simulator's traffic.",
             "",
             "| data | periods | drivers from | "

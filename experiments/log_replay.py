@@ -1,9 +1,11 @@
 """Replay of recorded scenes with egos that brake: takeovers, hand-backs, contacts, and the time it takes.
 
-    python experiments/log_replay.py [--data ../shared/data/trajectories] [--variants 1000]
+    python experiments/log_replay.py [--part braking policies benchmark] [--variants 1000]
+        [--data ../shared/data/trajectories]
 
 Writes experiments/results/log_replay.json and .md. Every vehicle of a scene is the ego in turn, in three
-ways each: it slows down for a moment, brakes for a moment, or brakes to a standstill and stays.
+ways each: it slows down for a moment, brakes for a moment, or brakes to a standstill and stays. In one scene
+planners take the wheel of every vehicle in turn. Parts that are not named keep their figures.
 """
 
 from __future__ import annotations
@@ -19,10 +21,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from limsim_jax.files import write_whole
+from limsim_jax.log_replay.pilot import PolicyPilot
 from limsim_jax.log_replay.recorded import Lanelet, Recorded, lanelet_network, read_platoon, read_scene
 from limsim_jax.log_replay.scene import Scene, build_scene
 from limsim_jax.log_replay.takeover import Record, as_logged, braking, replay, replay_many
 from limsim_jax.maps import build_lane_map
+from limsim_jax.policies.limsim_tm.policy import LimSimTM
+from limsim_jax.policies.pdm import PDMClosed
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
@@ -32,6 +38,8 @@ WAYS = {"3 m/s2 for 1 s": (3.0, 1.0), "6 m/s2 for 1 s": (6.0, 1.0), "6 m/s2, sta
 PLATOONS = {"no_ACC_handling_part22": 60.0, "no_ACC_handling_part26": 100.0, "short_dynamic_part20": 40.0}
 LONG = 40.0  # s, of recordings that can tell what share of vehicles is back within 20 s
 STRETCH = 60.0  # s of them: long enough to come back
+POLICIES = {"PDM-Closed": PDMClosed, "LimSim-TM": LimSimTM}
+DRIVEN = 6.0  # s of its log that a vehicle has left when a planner takes its wheel, at least
 AFTER = 1.0  # s after its first entry, or after the start of the benchmark's range, the ego brakes
 
 
@@ -52,10 +60,10 @@ def platoon(cars: int = 12, seconds: float = 60.0, dt: float = 0.1) -> Recorded:
     )  # fmt: skip
 
 
-def egos_of(scene: Scene, way: tuple[float, float]) -> Any:
-    """Every vehicle that is there for long enough."""
+def egos_of(scene: Scene, way: tuple[float, float], left: float = 1.0) -> Any:
+    """Every vehicle that is there for long enough: `left` s after it has been told."""
     there = np.asarray(scene.last - scene.first) * scene.log.dt
-    slots = np.flatnonzero(there > AFTER + 1)
+    slots = np.flatnonzero(there > AFTER + left)
     start = np.asarray(scene.first)[slots] * scene.log.dt + AFTER
     brake = jax.vmap(lambda s, t: braking(scene, s, t, *way))
     return brake(jnp.asarray(slots, jnp.int32), jnp.asarray(start, jnp.float32))
@@ -100,6 +108,47 @@ def measure(recorded: Recorded) -> list[dict[str, Any]]:
     return rows
 
 
+def driven(recorded: Recorded) -> list[dict[str, Any]]:
+    """Planners at the wheel of each vehicle in turn, until its log ends."""
+    lane_map = build_lane_map(recorded.network)
+    scene = build_scene(recorded, lane_map)
+    egos = egos_of(scene, (0.0, 1e6), DRIVEN)
+
+    @jax.jit
+    def run(scene: Scene, egos: Any, pilot: PolicyPilot) -> Any:
+        def one(ego: Any) -> Any:
+            counts, moments = replay(scene, ego, pilot=pilot, record=True)
+            assert moments is not None
+            return counts, jax.tree.map(lambda x: x[:, ego.slot], moments)
+
+        return jax.lax.map(one, egos, batch_size=8)
+
+    rows = []
+    slots = np.asarray(egos.slot)
+    there = np.asarray(egos.told).T & np.asarray(scene.log.valid)[:, slots]  # [T, egos]
+    for name, policy in POLICIES.items():
+        begin = time.perf_counter()
+        counts, me = jax.tree.map(
+            np.asarray, run(scene, egos, PolicyPilot(lane_map=lane_map, policy=policy()))
+        )
+        seconds = time.perf_counter() - begin
+        log = jax.tree.map(lambda x: np.asarray(x)[:, slots], (scene.log.x, scene.log.y, scene.log.v))
+        apart = np.hypot(me.x.T - log[0], me.y.T - log[1])
+        last = len(there) - 1 - there[::-1].argmax(0)
+        rows.append(
+            {
+                "policy": name, "scene": recorded.name, "egos": len(slots),
+                "takeovers": int(counts.takeovers.sum()),
+                "egos_with_contact": int(counts.struck.any((1, 2)).sum()),
+                "mean_speed": float(me.v.T[there].mean()), "mean_speed_of_log": float(log[2][there].mean()),
+                "apart_at_end_m": float(np.median(apart[last, np.arange(len(slots))])),
+                "seconds": seconds,
+            }
+        )  # fmt: skip
+        print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
 def benchmark(recorded: Recorded, variants: int) -> dict[str, Any]:
     """Time of many variants of a scene in one program."""
     scene = build_scene(recorded, build_lane_map(recorded.network))
@@ -131,7 +180,7 @@ def benchmark(recorded: Recorded, variants: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def table(rows: list[dict[str, Any]], bench: dict[str, Any]) -> str:
+def table(rows: list[dict[str, Any]], policies: list[dict[str, Any]], bench: dict[str, Any]) -> str:
     """Markdown."""
     columns = {
         "scene": "scene", "vehicles": "vehicles", "s": "seconds", "ego": "way", "egos": "egos",
@@ -159,6 +208,20 @@ def table(rows: list[dict[str, Any]], bench: dict[str, Any]) -> str:
         f"least {LONG:g} s and of egos that clear the way: on the 100 to 200 m of road of the others most",
         "vehicles leave before, and behind an ego that stays nobody can go back.",
         "",
+        f"Planners at the wheel of {policies[0]['egos']} vehicles of {policies[0]['scene']} in turn, each",
+        f"from {AFTER:g} s after its first moment to the end of its log:",
+        "",
+        "| policy | takeovers | egos with contact | mean speed, m/s | of the logs, m/s "
+        "| median distance from the log at its end, m |",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for r in policies:
+        lines.append(
+            f"| {r['policy']} | {r['takeovers']} | {r['egos_with_contact']} | {r['mean_speed']:.1f} "
+            f"| {r['mean_speed_of_log']:.1f} | {r['apart_at_end_m']:.1f} |"
+        )
+    lines += [
+        "",
         f"{b['variants']} variants of {b['scene']} ({b['vehicles']} vehicles, {b['steps']} steps) in one",
         f"program: compiled in {b['compile_s']:.1f} s, run in {b['run_s']:.1f} s "
         f"({b['cpu_s']:.1f} s of CPU),",
@@ -168,9 +231,13 @@ def table(rows: list[dict[str, Any]], bench: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+PARTS = ("braking", "policies", "benchmark")
+
+
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--variants", type=int, default=1000)
     options = parser.parse_args()
@@ -179,18 +246,25 @@ def main() -> None:
         raise SystemExit(
             f"{options.data}: no commonroad/*.xml.gz; the folder of recorded trajectories would be right"
         )
+    path = RESULTS / "log_replay.json"
+    found = json.loads(path.read_text()) if path.exists() and set(options.part) != set(PARTS) else {}
+    missing = [part for part in PARTS if part not in {*found, *options.part}]
+    if missing:
+        parser.error(f"--part: nothing is known of {', '.join(missing)}; name them too")
     scenes = [platoon(), *(read_scene(path) for path in files)]
     for name, start in PLATOONS.items():
         scenes.append(read_platoon(options.data / f"openacc_zalazone_{name}.csv.gz", start, STRETCH))
-    rows = [row for recorded in scenes for row in measure(recorded)]
-    bench = benchmark(next(r for r in scenes if r.name == BENCHMARK), options.variants)
-    print(json.dumps(bench), flush=True)
-    RESULTS.mkdir(exist_ok=True)
+    busy = next(scene for scene in scenes if scene.name == BENCHMARK)
+    if "braking" in options.part:
+        found["braking"] = [row for recorded in scenes for row in measure(recorded)]
+    if "policies" in options.part:
+        found["policies"] = driven(busy)
+    if "benchmark" in options.part:
+        found["benchmark"] = benchmark(busy, options.variants)
+        print(json.dumps(found["benchmark"]), flush=True)
     head = "Regenerate: `python experiments/log_replay.py`\n\n"
-    (RESULTS / "log_replay.json").write_text(
-        json.dumps({"scenes": rows, "benchmark": bench}, indent=1) + "\n"
-    )
-    (RESULTS / "log_replay.md").write_text(head + table(rows, bench) + "\n")
+    write_whole(path, json.dumps({part: found[part] for part in PARTS}, indent=1) + "\n")
+    write_whole(RESULTS / "log_replay.md", head + table(*(found[part] for part in PARTS)) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Mutation testing of the metrics: every one is made wrong, place by place, and a test has to notice.
 
-    python experiments/mutate_metrics.py [--modules safety scores ...] [--every 10] [--again] [--jobs 2]
+    python experiments/mutate_metrics.py [--modules safety scores ...] [--every 10] [--jobs 2]
+    python experiments/mutate_metrics.py --again --rest
 
 Five ways of being wrong, each applied wherever it can be (one place at a time):
 
@@ -101,6 +102,10 @@ SAME: dict[tuple[str, str, str], str] = {
         "TrafficMetrics._detect",
         "1 → 2",
     ): "moves all passages by a step, and headways are differences",
+    ("observer", "EvaluateEgo._step", "0 → 1"): "the detectors are none of those that are kept",
+    ("observer", "_look", "-1 → 1"): "the last axis of two is the second",
+    ("observer", "_look", "0 → 1"): "filled in by `_step`",
+    ("observer", "_zones", "1 → 2"): "before the lane in any case",
     ("episode", "EgoMetrics._update", "0.01 → 0.036000000000000004"): "tolerance of rounding",
     ("intervals", "", "10000 → 10001"): "within the noise of resampling",
     ("intervals", "", "2 → 3"): MEMORY,
@@ -299,7 +304,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--modules", nargs="+", choices=list(TESTS), default=list(TESTS), metavar="NAME")
     parser.add_argument("--every", type=int, default=1, help="only every so manieth mutant")
-    parser.add_argument("--again", action="store_true", help="only those that survived last time")
+    parser.add_argument("--again", action="store_true", help="try those that survived, keep other results")
+    parser.add_argument("--rest", action="store_true", help="try those not tried yet, keep other results")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()
     for name in ("every", "jobs"):
@@ -317,21 +323,27 @@ def main() -> None:
         source = (REPO / f"limsim_jax/metrics/{module}.py").read_text()
         if not survives(Mutant(module, "", 0, "", "", 0, source)):
             parser.error(f"{module}: its tests fail without any mutant")
-        known = {(row["function"], row["change"], row["nth"]): row for row in kept.get(module, [])}
-        chosen, rows = mutants(module), []
-        if options.again:
-            chosen = [m for m in chosen if (m.function, m.change, m.nth) in known]
-        else:
-            chosen, known = chosen[:: options.every], {}
+        known = {(row["function"], row["change"], row["nth"]): row["fate"] for row in kept.get(module, [])}
+        new = options.rest or not options.again
+        if new and not options.rest:
+            known = {}
+        chosen = [
+            mutant
+            for k, mutant in enumerate(mutants(module))
+            if (new and k % options.every == 0) or (mutant.function, mutant.change, mutant.nth) in known
+        ]
+        rows: list[dict[str, Any]] = []
         start = time.perf_counter()
 
         def fate(mutant: Mutant, known: dict[Any, Any] = known) -> str:
             before = known.get((mutant.function, mutant.change, mutant.nth))
-            return "killed" if (before and before["fate"] == "killed") or not survives(mutant) else "survived"
+            if before == "killed" or (before and not options.again):
+                return before
+            return "survived" if survives(mutant) else "killed"
 
         with ThreadPoolExecutor(options.jobs) as pool:
             for mutant, found in zip(chosen, pool.map(fate, chosen), strict=True):
-                row: dict[str, Any] = asdict(mutant)
+                row = asdict(mutant)
                 del row["source"]
                 rows.append(row | {"fate": found})
                 if found == "survived":

@@ -183,14 +183,11 @@ def closed_loop(result: dict[str, Any]) -> str:
     for one in result.values():
         if "left_of_default" not in one:
             continue
-        before, after, halves = (
-            one["held_out"]["default"],
-            one["held_out"]["closed_loop"],
-            one["floor"]["held_out"],
-        )
+        before, after = one["held_out"]["default"], one["held_out"]["closed_loop"]
+        halves, own = one["floor"]["held_out"], one["from_own"]["held_out"]
         cells = [
             f"{100 * one['left_of_default'][name]:.0f} %: {before[name]:.3g} to {after[name]:.3g} {unit} "
-            f"({halves[name]:.3g})"
+            f"({own[name]:.3g}, {halves[name]:.3g})"
             for name, unit in (("headway", "s"), ("speed", "m/s"), ("gap", "m"), ("flow", "veh/h"))
         ]
         rows.append(f"| {one['title']} | {' | '.join(cells)} |")

@@ -8,7 +8,9 @@ import pytest
 from conftest import SHARED, needs_shared
 
 from limsim_jax.calibration.cleaning import segments, split_in_time
+from limsim_jax.calibration.closed_loop import linked_recordings
 from limsim_jax.calibration.recordings import FOOT, RecordingError, read_recording
+from limsim_jax.calibration.report import gather
 
 TRAJECTORIES = SHARED / "trajectories"
 SAMPLES, DT = 301, 0.1
@@ -233,6 +235,8 @@ def test_every_kind_gives_the_same_traffic(kind, tmp_path):
     assert not recording.defects
     followers = np.unique(recording.vehicle[recording.leader >= 0])
     assert len(followers) == {"NGSIM": 4, "highD": 4}.get(kind, 2)
+    leaders = np.unique(recording.leader[recording.leader >= 0])
+    assert set(leaders) & set(followers), "the second vehicle follows and leads: one name for both"
     for follower in followers:
         rows = (recording.vehicle == follower) & (recording.leader >= 0)
         i = 1 + np.argmin([np.abs(recording.v[rows][:200] - v[i][:200]).mean() for i in (1, 2)])
@@ -248,6 +252,19 @@ def test_every_kind_gives_the_same_traffic(kind, tmp_path):
     assert len(found) == len(followers) and quality.drivers == len(followers)
     assert quality.kept == pytest.approx(len(followers) * SAMPLES * DT, rel=0.15)
     assert quality.speed_rms < 0.05
+
+
+def test_a_recording_serves_as_well_as_its_file(tmp_path):
+    paths = [tgsim(tmp_path), openacc(tmp_path)]
+    for some in (paths[0], paths):
+        read = [read_recording(path) for path in paths][: None if some is paths else 1]
+        (from_files, quality), (from_read, other) = gather(some), gather(read if some is paths else read[0])
+        assert quality == other and len(from_files) == len(from_read) > 0
+        for one, same in zip(from_files, from_read, strict=True):
+            assert (one.driver, one.leader, one.source) == (same.driver, same.leader, same.source)
+            np.testing.assert_array_equal(one.gap, same.gap)
+    linked = [linked_recordings(some, period=20.0) for some in (paths, read)]
+    assert linked[0].periods == linked[1].periods and linked[0].drivers == linked[1].drivers
 
 
 def gap_of(kind, i):

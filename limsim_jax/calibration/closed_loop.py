@@ -10,7 +10,7 @@ The scores of the drivers are the same whatever the population is (common random
 two distributions is the mean distance of their sorted samples (Wasserstein-1), so the loss has gradients by
 the population, through the rollout. Periods are held out; `ClosedLoop` has the distances there, before and
 after, and two yardsticks: how far apart two halves of the recorded vehicles themselves are, and how far a
-record is from a population that made it. Nearer than that no population comes.
+record is from the population that made it, which is as near as one comes that is exactly right.
 
 What has no gradient is for `matching`.
 """
@@ -36,7 +36,7 @@ from scipy.stats import truncnorm, wasserstein_distance
 from limsim_jax.calibration.cleaning import Segment, segments
 from limsim_jax.calibration.fit import LOWER, MODELS, PARAMETERS, UPPER, driver
 from limsim_jax.calibration.population import Law, write_population
-from limsim_jax.calibration.recordings import RecordingError, read_recording
+from limsim_jax.calibration.recordings import RecordingError, Source, as_recording
 from limsim_jax.traffic.car_following import CarFollowing, ballistic
 from limsim_jax.traffic.vehicles import CUT, default_population, sample_vehicles
 
@@ -402,9 +402,8 @@ def from_own(
 ) -> Distances:
     """Distances of a record that the population itself has made from its other simulations, the mean.
 
-    That is what is left when a population is exactly right, since other drivers are drawn each time: of
-    a record of this size and these leaders no population can be expected to come nearer. Arguments as of
-    `evaluate`, `K` >= 2.
+    Other drivers are drawn each time, so this is left when a population is exactly right, of a record of
+    this size and with these leaders. Arguments as of `evaluate`, `K` >= 2.
     """
     gap, v = _at_samples(model, parameters, chains, recorded, dt)
 
@@ -631,7 +630,7 @@ def hold_out(linked: Linked, share: float = 0.6) -> tuple[list[int], list[int]]:
 
 
 def linked_recordings(
-    paths: Sequence[str | Path], *, period: float = PERIOD, settle: float = SETTLE, dt: float = 0.1
+    sources: Sequence[Source], *, period: float = PERIOD, settle: float = SETTLE, dt: float = 0.1
 ) -> Linked:
     """Chains of all recordings but those that cannot be used.
 
@@ -640,9 +639,9 @@ def linked_recordings(
     """
     found: list[Segment] = []
     refused: list[RecordingError] = []
-    for path in paths:
+    for source in sources:
         try:
-            found += segments(read_recording(path), dt=dt, shortest=_SHORT, margins=False)[0]
+            found += segments(as_recording(source), dt=dt, shortest=_SHORT, margins=False)[0]
         except RecordingError as error:
             refused.append(error)
     if refused and not found:

@@ -109,6 +109,9 @@ class Recording:
         return len(self.time)
 
 
+Source = str | Path | Recording
+"""Of recorded data: a file, or what was read from one."""
+
 _ROWS = ("line", "vehicle", "time", "x", "y", "v", "a", "lane", "length", "vehicle_class", "leader")
 _ROWS += ("x_lead", "v_lead", "length_lead")
 
@@ -140,6 +143,11 @@ def read_recording(path: str | Path) -> Recording:
         f"{path}: line 1: no recording of a known kind (NGSIM, TGSIM pairs, OpenACC, highD, inD, "
         f"CommonRoad); its columns are {', '.join(columns)[:200]}"
     )
+
+
+def as_recording(source: Source) -> Recording:
+    """The recording itself, or the file read, with the errors of `read_recording`."""
+    return source if isinstance(source, Recording) else read_recording(source)
 
 
 # --- files -------------------------------------------------------------------------------------------
@@ -327,9 +335,8 @@ def _ngsim_classes(table: _Table) -> Ints:
 def _tgsim_pairs(table: _Table) -> Recording:
     """Positions along the road; `spacing` tells the length that was taken off."""
     run, follower = table.text("run_no"), table.text("follower_id")
-    kind = table.text("leader_kind") if "leader_kind" in table else np.full(len(table), "")
     who = _joined_text("run ", run, " vehicle ", follower)
-    lead = _joined_text("run ", run, " vehicle ", table.text("leader_id"), " ", kind)
+    lead = _joined_text("run ", run, " vehicle ", table.text("leader_id"))
     names, (vehicle, leader) = _named(who, lead)
     columns = {
         "time": "timestamp",
@@ -1058,4 +1065,4 @@ def _defects(r: Recording) -> Iterator[Defect]:
             )
 
 
-__all__ = ["TOLERATED", "Defect", "Recording", "RecordingError", "read_recording"]
+__all__ = ["TOLERATED", "Defect", "Recording", "RecordingError", "Source", "as_recording", "read_recording"]

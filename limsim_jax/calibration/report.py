@@ -24,7 +24,7 @@ from limsim_jax.calibration.fit import (
     stack,
 )
 from limsim_jax.calibration.population import Law, estimate, predictive_check, write_population
-from limsim_jax.calibration.recordings import RecordingError, read_recording
+from limsim_jax.calibration.recordings import Recording, RecordingError, Source, as_recording
 from limsim_jax.calibration.uncertainty import Uncertainty, uncertainty
 
 PUBLISHED = (0.11, 0.29)
@@ -171,28 +171,28 @@ def _summary(values: Floats) -> dict[str, float]:
 
 
 def gather(
-    paths: str | Path | Sequence[str | Path], *, shortest: float = SHORTEST, dt: float = 0.1
+    sources: Source | Sequence[Source], *, shortest: float = SHORTEST, dt: float = 0.1
 ) -> tuple[list[Segment], list[Quality]]:
-    """Segments of all files; drivers of several files have the file in their names.
+    """Segments of all recordings; drivers of several have the file in their names.
 
-    A file in which nobody follows long enough is left out if there are others.
+    A recording in which nobody follows long enough is left out if there are others.
 
     Raises:
       RecordingError: a file cannot be used, or nothing is left.
     """
-    paths = [paths] if isinstance(paths, (str, Path)) else list(paths)
+    sources = [sources] if isinstance(sources, (str, Path, Recording)) else list(sources)
     found: list[Segment] = []
     qualities: list[Quality] = []
     refused: list[RecordingError] = []
-    for path in paths:
-        recording = read_recording(path)
+    for source in sources:
+        recording = as_recording(source)
         try:
             some, quality = segments(recording, dt=dt, shortest=shortest)
         except RecordingError as error:
             refused.append(error)
             continue
-        if len(paths) > 1:
-            stem = Path(path).name.split(".")[0]
+        if len(sources) > 1:
+            stem = Path(recording.source).name.split(".")[0]
             some = [replace(segment, driver=f"{stem}: {segment.driver}") for segment in some]
         found += some
         qualities.append(quality)
@@ -203,7 +203,7 @@ def gather(
 
 
 def calibrate(
-    paths: str | Path | Sequence[str | Path],
+    sources: Source | Sequence[Source],
     *,
     model: str = "idm",
     objective: str = "mixed",
@@ -216,7 +216,7 @@ def calibrate(
     """Calibrate the drivers of recordings, validate them, and estimate their population.
 
     Args:
-      paths: one or more recordings.
+      sources: one or more recordings, or their files.
       model: "idm", "iidm" or "acc".
       objective: what to make least, see `fit.residuals`.
       method: "lm", "lbfgs", "adam" or "de".
@@ -232,7 +232,7 @@ def calibrate(
     begin = time.perf_counter()
     if not 0.1 <= first <= 0.9:
         raise ValueError(f"first = {first:g}; a share from 0.1 to 0.9 is needed")
-    found, quality = gather(paths, shortest=shortest)
+    found, quality = gather(sources, shortest=shortest)
     early, late = split_in_time(found, first)
     both = {part.driver for part in early} & {part.driver for part in late}
     early, late = ([part for part in parts if part.driver in both] for parts in (early, late))

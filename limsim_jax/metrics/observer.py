@@ -120,7 +120,7 @@ class EvaluateEgo:
         leaves = look.traffic.left[slot] & routes.is_goal[carry.lane, carry.goal]
         on_route = routes.reachable[lane, carry.goal]
         reached = seen.arrived & routes.is_goal[lane, carry.goal]
-        to_go = jnp.where((lane != NO_LANE) & on_route, routes.distance[lane, carry.goal] - s, carry.to_go)
+        to_go = jnp.where(on_route, routes.distance[lane, carry.goal] - s, carry.to_go)
         to_go = jnp.where(leaves | reached, 0, to_go)
         seen = seen._replace(
             relevant=relevant,
@@ -178,7 +178,7 @@ def _look(
     ran = ((state.status & int(Status.RED_LIGHT)) != 0) & (lane_map.junction[state.lane] >= 0)
     wrong = (state.status & int(Status.WRONG_WAY)) != 0
     following = routes.next_lane[lane, state.goal[slot]]
-    waits = red[following] & (v < _STANDS) & (lane_map.stop_s[lane] - s < AT_RED) & (following != NO_LANE)
+    waits = red[following] & (v < _STANDS) & (lane_map.stop_s[lane] - s < AT_RED)
 
     # the road at the ego
     at, at_s = body_place(lane_map, lane, state.previous[slot], s, state.shape.length[slot])
@@ -253,11 +253,10 @@ def _zones(lane_map: LaneMap, state: State, slot: Int[Array, ""], following: Int
     ego = jnp.stack([state.previous[slot], state.lane[slot], following])
     end = lane_map.length[ego]
     front = jnp.stack([state.s[slot] + end[0], state.s[slot], jnp.float32(-1)])  # m along each of the three
-    row = jnp.where(ego == NO_LANE, -1, table.connector[ego])
+    row = table.connector[ego]  # the null row where there is none: stretches that are absent hold nobody
     foe = table.foe[row]
     count = foe.shape[1]
-    exists = (foe >= 0) & (row >= 0)[:, None]
-    zone = jnp.where(exists, row[:, None] * count + jnp.arange(count)[None], -1)
+    zone = jnp.where(foe >= 0, row[:, None] * count + jnp.arange(count)[None], -1)
 
     def inside(front: Array, length: Array, begin: Array, end: Array) -> Array:
         return (front > begin) & (front - length < end)
@@ -271,9 +270,9 @@ def _zones(lane_map: LaneMap, state: State, slot: Int[Array, ""], following: Int
     theirs = jnp.zeros((), bool)
     for at, front in ((state.lane, state.s), (state.previous, tail)):
         at, front, length = (x[None, None] for x in (at, front, state.shape.length))
-        theirs |= (lane == at) & (at != NO_LANE) & inside(front, length, begin, end)
+        theirs |= (lane == at) & inside(front, length, begin, end)
     theirs = (theirs & others[None, None]).any(-1)
-    return Zones(zone.ravel(), (mine & exists).ravel(), (theirs & exists).ravel())
+    return Zones(zone.ravel(), mine.ravel(), theirs.ravel())
 
 
 def _meets_ego(
@@ -283,8 +282,7 @@ def _meets_ego(
     table = lane_map.conflicts
     lanes = jnp.concatenate([way, other[:, None]], -1)
     mine = lanes[slot]
-    row = jnp.where(mine == NO_LANE, -1, table.connector[mine])
-    foes = jnp.where(row[:, None] >= 0, table.lane[table.foe[row]], NO_LANE).ravel()
+    foes = table.lane[table.foe[table.connector[mine]]].ravel()  # NO_LANE where there is none
     ours = jnp.concatenate([mine, foes])
     meets = (lanes[..., None] == ours[None, None]) & (ours != NO_LANE)[None, None]
     return meets.any((-1, -2))
