@@ -104,6 +104,7 @@ SAME: dict[tuple[str, str, str], str] = {
     ): "moves all passages by a step, and headways are differences",
     ("observer", "EvaluateEgo._step", "0 → 1"): "the detectors are none of those that are kept",
     ("observer", "_look", "-1 → 1"): "the last axis of two is the second",
+    ("observer", "_meets_ego", "-1 → 1"): "the last axis of two is the second",
     ("observer", "_look", "0 → 1"): "filled in by `_step`",
     ("observer", "_zones", "1 → 2"): "before the lane in any case",
     ("episode", "EgoMetrics._update", "0.01 → 0.036000000000000004"): "tolerance of rounding",

@@ -171,6 +171,24 @@ def calibration(result: dict[str, Any]) -> str:
     made = result["synthetic"]["parameters"]
     errors = (f"{name} {100 * made[name]['median_error']:.1f} %" for name in made)
     rows += ["", f"Median over drivers. Median error of parameters on made-up drivers: {', '.join(errors)}."]
+    fits = [
+        (model, one["drivers"], row)
+        for one in result.values()
+        for model, row in one.get("models", {}).items()
+    ]
+    beside = []
+    for model in dict.fromkeys(model for model, *_ in fits):
+        mine = [(drivers, row) for name, drivers, row in fits if name == model]
+        lm, de = (sum(row[f"{method}_worse"] for _, row in mine) for method in ("lm", "de"))
+        beside.append(
+            f"{lm} of {sum(drivers for drivers, _ in mine)} with {model.upper()} (the other way {de})"
+        )
+    times = [row["lm_seconds"] / row["de_seconds"] for *_, row in fits]
+    rows += [
+        "",
+        "Levenberg-Marquardt beside differential evolution, on the same data and objective: worse by more "
+        f"than 1 % for {', '.join(beside)} drivers, in {min(times):.2f} to {max(times):.2f} of its time.",
+    ]
     return "\n".join(rows)
 
 

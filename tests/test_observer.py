@@ -49,7 +49,10 @@ def crossing() -> LaneMap:
         stop_s=jnp.where(lane_map.valid, stop_s, lane_map.stop_s),
         height=jnp.asarray(height),
         conflicts=dataclasses.replace(
-            table, must_stop=jnp.asarray(signs), s_in=jnp.where(early, 0.2, table.s_in)
+            table,
+            must_stop=jnp.asarray(signs),
+            s_in=jnp.where(early, 0.2, table.s_in),
+            f_out=jnp.where(early, 400.0, table.f_out),
         ),
     )
 
@@ -121,7 +124,7 @@ def random_state(rng, slot: int, lane: int | None = None) -> State:
     if m.is_connector[on[slot]] and rng.random() < 0.6:
         foe = m.conflicts.lane[m.conflicts.foe[m.conflicts.connector[on[slot]], 0]]
         s[slot] = rng.choice([0.0, 1.5]) * rng.random()
-        before[slot] = rng.choice([m.predecessors[on[slot], 0], foe, NO_LANE], p=[0.8, 0.1, 0.1])
+        before[slot] = rng.choice([m.predecessors[on[slot], 0], foe, NO_LANE], p=[0.6, 0.3, 0.1])
     elif m.routes.is_goal[on[slot]].any() and rng.random() < 0.5:
         s[slot] = length[slot] + rng.uniform(-1, 2)
     goal = rng.choice(goals, N)
