@@ -6,6 +6,7 @@ connectors and some lanes lifted to bridges. What other modules say of bodies an
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -58,7 +59,7 @@ def crossing() -> LaneMap:
 
 
 @functools.cache
-def host() -> LaneMap:
+def host() -> Any:
     """The same map in NumPy."""
     return jax.tree.map(np.asarray, crossing())
 
@@ -100,7 +101,13 @@ def blank() -> State:
     """Nobody anywhere."""
     nothing = np.zeros(N, np.float32)
     state = start_state(
-        crossing(), drivers(N), shapes(N), lane=np.full(N, NO_LANE), s=nothing, v=nothing, goal=i32(nothing)
+        crossing(),
+        drivers(N),
+        shapes(N),
+        lane=i32(np.full(N, NO_LANE)),
+        s=f32(nothing),
+        v=f32(nothing),
+        goal=i32(nothing),
     )
     return jax.tree.map(np.asarray, state)
 
@@ -216,7 +223,7 @@ def looks_at(ticks):
     for begin in range(0, len(ticks), size):
         part = ticks[begin : begin + size]
         looks = jax.tree.map(np.asarray, _looks(crossing(), stacked(part + part[:1] * (size - len(part)))))
-        parts += [jax.tree.map(lambda x: x[i], looks) for i in range(len(part))]  # noqa: B023
+        parts += [jax.tree.map(lambda x, i=i: x[i], looks) for i in range(len(part))]
     return parts
 
 
@@ -239,12 +246,13 @@ def given():
         wide, other = width(m, state.lane, state.s), other_lane(m, state)[0]
         return box, z, wide, other, pose(m, lane, s)[2], off_road(m, state, box)
 
-    told = ask(state, i32([lane for lane, _ in places]), f32([s for _, s in places]))
-    return [jax.tree.map(lambda x: x[i], jax.tree.map(np.asarray, told)) for i in range(WORLDS)]  # noqa: B023
+    told: Any = ask(state, i32([lane for lane, _ in places]), f32([s for _, s in places]))
+    told = jax.tree.map(np.asarray, told)
+    return [jax.tree.map(lambda x, i=i: x[i], told) for i in range(WORLDS)]
 
 
-def each(name: str):
-    """The step, what is said of the ego under a name, and the number, for all random steps."""
+def each(name: str) -> Iterator[Any]:
+    """Of all random steps: number, state, step, slot of the ego, and what is said of it under a name."""
     for i, (tick, look) in enumerate(seen()):
         yield i, tick.state, tick, int(tick.state.egos.slot[0]), getattr(look.ego, name)
 
@@ -265,7 +273,7 @@ def test_plain_columns_are_those_of_the_state():
         assert traffic.inside.all() and not traffic.changed.any()
         np.testing.assert_array_equal(look.way, tick.decision.way)
         np.testing.assert_array_equal(look.other, given()[i][3])
-        assert look.stopped == state.stopped[slot] and ego.off_road == tick.off_road[slot]
+        assert look.stopped == state.stopped[slot] and ego.off_road == np.asarray(tick.off_road)[slot]
 
 
 def test_bodies_and_who_is_on_the_same_level():
@@ -295,7 +303,9 @@ def test_who_is_in_several_lanes():
         for k in range(N):
             left, right = state.d[k] + state.shape.width[k] / 2, state.d[k] - state.shape.width[k] / 2
             half = given()[i][2][k] / 2
-            assert found[k] == (state.side[k] != 0 or left > half or right < -half or tick.off_road[k])
+            assert found[k] == (
+                state.side[k] != 0 or left > half or right < -half or np.asarray(tick.off_road)[k]
+            )
 
 
 def test_the_leader_has_moved_since_the_decision():
@@ -519,7 +529,7 @@ class Recorder:
         self.shown.append(jax.tree.map(np.asarray, shown[-1]))
         return self.judge and self.judge.update(carry, *shown)
 
-    def result(self, carry, *area):
+    def result(self, carry, *area) -> Any:
         return self.judge.result(carry, *area) if self.judge else {"told": carry}
 
 
@@ -534,6 +544,8 @@ class Seats:
 
 
 class Watched(EvaluateEgo):
+    pair: Any = None
+
     def judge(self, ego, traffic):
         object.__setattr__(self, "pair", (ego, traffic))
         return self
@@ -595,7 +607,9 @@ def test_progress_arrival_and_signs_over_time():
         start = ticks[0].state
         goal = start.goal[slot]
         was, stopped, to_go = start.lane[slot], False, 0.0
-        before = None
+        half = len(looks) // 2
+        before: Any = None
+        look: Any = None
         assert len(ego.shown) == len(looks) + 1
         for t, step in enumerate(ego.shown):
             flow = traffic.shown[t]
@@ -624,7 +638,7 @@ def test_progress_arrival_and_signs_over_time():
                 totals["signs"] += bool(step.stop_sign)
                 totals["pardoned"] += bool(look.ego.stop_sign and stopped)
             stopped = bool(state.stopped[slot]) or (stopped and lane == was)
-            for k in range(N) if before is not None else ():
+            for k in range(N) if t else ():
                 both = state.active[k] and before.active[k] and state.lane[k] != before.lane[k]
                 assert flow.changed[k] == (both and state.s[k] > dx[k])
                 totals["changed"] += bool(flow.changed[k])
@@ -635,7 +649,6 @@ def test_progress_arrival_and_signs_over_time():
             if lane != NO_LANE:
                 was = lane
             before = state
-            half = len(looks) // 2
             index = {0: 0, half: 1, len(looks): 2}.get(t)
             if index is not None:
                 found = carries[index]
