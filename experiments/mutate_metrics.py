@@ -325,13 +325,13 @@ def main() -> None:
         if not survives(Mutant(module, "", 0, "", "", 0, source)):
             parser.error(f"{module}: its tests fail without any mutant")
         known = {(row["function"], row["change"], row["nth"]): row["fate"] for row in kept.get(module, [])}
-        new = options.rest or not options.again
-        if new and not options.rest:
-            known = {}
+        anew = not (options.again or options.rest)
+        known = {} if anew else known
+        stride = options.every if anew or options.rest else 0  # 0: nothing new
         chosen = [
             mutant
             for k, mutant in enumerate(mutants(module))
-            if (new and k % options.every == 0) or (mutant.function, mutant.change, mutant.nth) in known
+            if (stride and k % stride == 0) or (mutant.function, mutant.change, mutant.nth) in known
         ]
         rows: list[dict[str, Any]] = []
         start = time.perf_counter()

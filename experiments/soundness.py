@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from limsim_jax.bench import build_traffic
+from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, bundled_maps, load_map
 from limsim_jax.rollout import Rollout, Worlds, use_all_cores
 from limsim_jax.traffic.demand import sample_scenario
@@ -132,8 +133,8 @@ def main() -> None:
         jax.clear_caches()
     RESULTS.mkdir(exist_ok=True)
     head = "Regenerate: `python experiments/soundness.py`\n\n"
-    file.write_text(json.dumps({"maps": list(rows.values())}, indent=1) + "\n")
-    (RESULTS / f"{options.out}.md").write_text(head + table(list(rows.values())) + "\n")
+    write_whole(file, json.dumps({"maps": list(rows.values())}, indent=1) + "\n")
+    write_whole(RESULTS / f"{options.out}.md", head + table(list(rows.values())) + "\n")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from limsim_jax.calibration.closed_loop import (
     calibrate_closed_loop,
     distances,
     drawn,
-    evaluate,
     floor,
     from_own,
     headway,
@@ -25,6 +24,7 @@ from limsim_jax.calibration.closed_loop import (
     samples,
     scores,
     simulate,
+    simulate_samples,
     wasserstein,
 )
 from limsim_jax.calibration.fit import MODELS, PARAMETERS, rollout, stack
@@ -247,7 +247,7 @@ def test_a_record_of_its_own_is_as_far_as_other_draws_are(known):
     points = int(recorded.point.max()) + 1
     root = jnp.asarray(np.diag(SPREAD), jnp.float32)
     parameters = drawn(jnp.asarray(np.log(TRUTH), jnp.float32), root, scores(4, len(part.drivers), 3))
-    found = from_own(MODEL, parameters, chains, recorded, DT, points)
+    found = from_own(recorded, *simulate_samples(MODEL, parameters, chains, recorded, DT), points)
     each = [jax.vmap(lambda p, c: simulate(MODEL, p, c, DT))(p[recorded.who], chains) for p in parameters]
     gap, v = (
         np.stack([np.asarray(x).reshape(-1)[recorded.at] for x in leaf]) for leaf in zip(*each, strict=True)
@@ -259,7 +259,8 @@ def test_a_record_of_its_own_is_as_far_as_other_draws_are(known):
     means = v.mean(1)
     apart = [abs(means[k] - np.delete(means, k).mean()) for k in range(4)]
     assert float(found.mean_speed) == pytest.approx(np.mean(apart), abs=1e-4)
-    alike = from_own(MODEL, jnp.broadcast_to(parameters[:1], parameters.shape), chains, recorded, DT, points)
+    same = jnp.broadcast_to(parameters[:1], parameters.shape)
+    alike = from_own(recorded, *simulate_samples(MODEL, same, chains, recorded, DT), points)
     assert max(float(x) for x in alike) < 1e-3
 
 
@@ -285,7 +286,7 @@ def test_gradients_are_those_of_finite_differences(known):
     @jax.jit
     def loss(shift):
         p = drawn(jnp.log(jnp.asarray(TYPICAL, jnp.float32)) + shift, root, z)
-        found = evaluate(MODEL, p, chains, recorded, DT, points)[0]
+        found = distances(recorded, *simulate_samples(MODEL, p, chains, recorded, DT), points)
         return found.headway + found.speed + found.gap / 10 + found.flow / 300
 
     zero = jnp.zeros(5)

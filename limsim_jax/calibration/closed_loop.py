@@ -342,6 +342,7 @@ def headway(gap: Array, v: Array, length_lead: Array) -> Array:
     return jnp.minimum((jnp.maximum(gap, 0) + length_lead) / jnp.maximum(v, SLOWEST), LONGEST)
 
 
+@partial(jax.jit, static_argnames="points")
 def distances(recorded: Samples, gap: Float[Array, "K M"], v: Float[Array, "K M"], points: int) -> Distances:
     """Of `K` simulations from the record, given gaps and speeds at its samples."""
     flat = headway(gap, v, recorded.length_lead[None]).reshape(-1), v.reshape(-1), gap.reshape(-1)
@@ -357,16 +358,11 @@ def distances(recorded: Samples, gap: Float[Array, "K M"], v: Float[Array, "K M"
     )
 
 
-@partial(jax.jit, static_argnames=("model", "dt", "points"))
-def evaluate(
-    model: CarFollowing,
-    parameters: Float[Array, "K D P"],
-    chains: Chains,
-    recorded: Samples,
-    dt: float,
-    points: int,
-) -> tuple[Distances, Float[Array, ""]]:
-    """Distances of `K` simulations, and the share of the samples in which bodies overlap.
+@partial(jax.jit, static_argnames=("model", "dt"))
+def simulate_samples(
+    model: CarFollowing, parameters: Float[Array, "K D P"], chains: Chains, recorded: Samples, dt: float
+) -> tuple[Float[Array, "K M"], Float[Array, "K M"]]:
+    """Gaps, m, and speeds, m/s, of `K` simulations of all periods, where the record is compared.
 
     Args:
       model: of car following.
@@ -374,16 +370,7 @@ def evaluate(
       chains: all periods, `[W T V]`.
       recorded: from `samples`.
       dt: s.
-      points: of the fundamental diagram.
     """
-    gap, v = _at_samples(model, parameters, chains, recorded, dt)
-    return distances(recorded, gap, v, points), jnp.mean((gap <= 0).astype(gap.dtype))
-
-
-def _at_samples(
-    model: CarFollowing, parameters: Float[Array, "K D P"], chains: Chains, recorded: Samples, dt: float
-) -> tuple[Float[Array, "K M"], Float[Array, "K M"]]:
-    """Gaps, m, and speeds, m/s, of simulations where the record is compared."""
     rows = parameters[:, recorded.who]  # [K W V P]
     each = jax.vmap(lambda p, chains: simulate(model, p, chains, dt))
     gap, v = jax.vmap(each, in_axes=(0, None))(rows, chains)
@@ -391,27 +378,18 @@ def _at_samples(
     return gap, v
 
 
-@partial(jax.jit, static_argnames=("model", "dt", "points"))
-def from_own(
-    model: CarFollowing,
-    parameters: Float[Array, "K D P"],
-    chains: Chains,
-    recorded: Samples,
-    dt: float,
-    points: int,
-) -> Distances:
-    """Distances of a record that the population itself has made from its other simulations, the mean.
+@partial(jax.jit, static_argnames="points")
+def from_own(recorded: Samples, gap: Float[Array, "K M"], v: Float[Array, "K M"], points: int) -> Distances:
+    """Distances of one of `K` >= 2 simulations, as if it were the record, from the others; the mean.
 
     Other drivers are drawn each time, so this is left when a population is exactly right, of a record of
-    this size and with these leaders. Arguments as of `evaluate`, `K` >= 2.
+    this size and with these leaders. Arguments as of `distances`.
     """
-    gap, v = _at_samples(model, parameters, chains, recorded, dt)
 
     def one(k: Array) -> Distances:
         others = jnp.arange(gap.shape[0] - 1)
         others = jnp.where(others >= k, others + 1, others)
-        made = recorded._replace(gap=gap[k], v=v[k])
-        return distances(made, gap[others], v[others], points)
+        return distances(recorded._replace(gap=gap[k], v=v[k]), gap[others], v[others], points)
 
     found = jax.lax.map(one, jnp.arange(gap.shape[0]))
     return jax.tree.map(lambda x: jnp.mean(x), found)
@@ -488,7 +466,8 @@ def _descend(
 
     def loss(point: _Point) -> Array:
         parameters = drawn(*_moved(mean, root, point), z)
-        found = evaluate(model, parameters, chains, recorded, dt, points)[0]
+        gap, v = simulate_samples(model, parameters, chains, recorded, dt)
+        found = distances(recorded, gap, v, points)
         tame = jnp.sum(point.shift**2 / jnp.sum(root * root, axis=-1)) + jnp.sum(point.wider**2)
         return jnp.sum(jnp.stack(found) * scale) + _TAME * tame
 
@@ -704,16 +683,13 @@ def calibrate_closed_loop(
         "start": drawn(mean, root, z),
         "closed_loop": drawn(*after, z),
     }
-    found = [
-        {name: evaluate(drive, p, chains, log, linked.dt, n) for name, p in drivers.items()}
-        for chains, log, n in zip(fields, recorded, points, strict=True)
-    ]
-    own = [
-        from_own(drive, drivers["closed_loop"], chains, log, linked.dt, n)
-        for chains, log, n in zip(fields, recorded, points, strict=True)
-    ]
+    apart, own, overlaps = [], [], {}
+    for chains, log, n in zip(fields, recorded, points, strict=True):
+        made = {name: simulate_samples(drive, p, chains, log, linked.dt) for name, p in drivers.items()}
+        apart.append({name: _on_host(distances(log, *both, n)) for name, both in made.items()})
+        own.append(_on_host(from_own(log, *made["closed_loop"], n)))
+        overlaps = {name: float(jnp.mean(gap <= 0)) for name, (gap, _) in made.items()}
     factor = np.asarray(after[1], float)
-    fitted, held_out = ({name: _on_host(row[0]) for name, row in part.items()} for part in found)
     law = replace(start, mean=np.asarray(after[0], float), covariance=factor @ factor.T, model=model)
     return ClosedLoop(
         law=law,
@@ -721,11 +697,11 @@ def calibrate_closed_loop(
         model=model,
         sources=tuple(dict.fromkeys(linked.sources)),
         periods=(parts[0].periods, parts[1].periods),
-        fitted=fitted,
-        held_out=held_out,
+        fitted=apart[0],
+        held_out=apart[1],
         floors=(floor(parts[0]), floor(parts[1])),
-        from_own=(_on_host(own[0]), _on_host(own[1])),
-        overlaps={name: float(row[1]) for name, row in found[1].items()},
+        from_own=(own[0], own[1]),
+        overlaps=overlaps,  # of the last: the periods held out
         samples=(len(recorded[0].at), len(recorded[1].at)),
         losses=np.asarray(losses, float),
         seconds=time.perf_counter() - begin,
@@ -755,7 +731,6 @@ __all__ = [
     "default_drivers",
     "distances",
     "drawn",
-    "evaluate",
     "floor",
     "from_own",
     "headway",
@@ -765,5 +740,6 @@ __all__ = [
     "samples",
     "scores",
     "simulate",
+    "simulate_samples",
     "wasserstein",
 ]
