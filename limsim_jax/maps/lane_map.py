@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -453,6 +453,7 @@ def build_lane_map(
         MapError: no lane for motor traffic, numbers that are not finite, a link to a lane that is not
             there, or a lane that cannot be followed within `WORST_DEVIATION`.
     """
+    network = _without_side_steps(network, report)
     lanes = list(network.drivable_lanes())
     if not lanes:
         raise MapError("no lane that motor traffic may use", file=network.source)
@@ -501,6 +502,44 @@ def build_lane_map(
     sight = max(_lanes_in_sight(lanes, lane_rows(network)), _LEAST["sight"])
     lane_map = LaneMap(**arrays, **_rule_tables(network, goals, num_lanes), lanes_in_sight=sight)
     return jax.tree.map(lambda array: jnp.asarray(_device_type(array)), lane_map)
+
+
+def _without_side_steps(network: Network, report: ImportReport | None) -> Network:
+    """The network without links by which a vehicle would leap sideways, where a lane beside goes on instead.
+
+    Some files let two lanes go on as one where one of them ends beside it. Who is on that one changes lanes.
+    """
+    lanes = dict(network.lanes)
+    for lane in network.drivable_lanes():
+        beside = [lanes[name] for name in (lane.left, lane.right) if name in lanes]
+        for name in lane.successors:
+            after = lanes.get(name)
+            others = [] if after is None else [x for x in beside if name in x.successors]
+            if after is None or not others or _side_step(lane, after) <= lane.width[-1] / 2:
+                continue
+            if min(_side_step(x, after) for x in others) > lane.width[-1] / 2:
+                continue
+            lanes[lane.id] = replace(
+                lanes[lane.id], successors=tuple(x for x in lanes[lane.id].successors if x != name)
+            )
+            lanes[name] = replace(
+                lanes[name], predecessors=tuple(x for x in lanes[name].predecessors if x != lane.id)
+            )
+            if report is not None:
+                report.repaired(
+                    "lane link",
+                    f"{lane.id} -> {name}",
+                    f"{name} begins {_side_step(lane, after):.1f} m beside the end of {lane.id}: traffic "
+                    f"changes to {others[0].id}, which goes on as it",
+                )
+    return network if lanes == network.lanes else replace(network, lanes=lanes)
+
+
+def _side_step(before: Lane, after: Lane) -> float:
+    """m across the track from the end of a lane to the start of the next."""
+    off = after.xyz[0, :2] - before.xyz[-1, :2]
+    heading = before.heading[-1]
+    return abs(float(off[1] * np.cos(heading) - off[0] * np.sin(heading)))
 
 
 def _rule_tables(network: Network, goals: Goals | None, num_lanes: int) -> dict[str, Any]:

@@ -39,7 +39,7 @@ from limsim_jax.maps.network import Lane, Network
 from limsim_jax.numerics import safe_sqrt
 from limsim_jax.traffic.car_following import desired_speed
 from limsim_jax.traffic.ego import from_lane
-from limsim_jax.traffic.motion import boxes
+from limsim_jax.traffic.motion import boxes, tails
 from limsim_jax.traffic.neighbors import lanes_ahead, look_ahead, neighbors, other_lane, sort_vehicles
 from limsim_jax.traffic.vehicles import BODY, PARAMETERS, Population, sample_vehicles
 from limsim_jax.types import Config, Driver, Egos, Lights, Queues, Scenario, Schedule, Shape, State
@@ -1154,10 +1154,9 @@ def _room_ahead(
     It stands where it would be now had it entered up to `late` s ago, as far as leaders let it.
     """
     gap = jnp.full((row.shape[0], state.lane.shape[0]), _FAR)  # m to the rear of every vehicle
-    # every vehicle on its lane, on the other one if it changes lanes, and on the one that its tail is on
-    tail = jnp.where(state.s < state.shape.length, state.previous, NO_LANE)
-    tail_s = state.s + lane_map.length[state.previous]
-    for lane, front in ((state.lane, state.s), other_lane(lane_map, state), (tail, tail_s)):
+    # every vehicle on its lane, on the other one if it changes lanes, and on those that its tail is on
+    behind = zip(*(x.T for x in tails(lane_map, state)), strict=True)
+    for lane, front in ((state.lane, state.s), other_lane(lane_map, state), *behind):
         here = jnp.where(state.active & (lane != NO_LANE), lane, _NOWHERE)[None]
         rear = (front - state.shape.length)[None]
         beyond = front[None] > schedule.s[row, None]

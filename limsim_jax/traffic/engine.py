@@ -38,7 +38,7 @@ from limsim_jax.traffic.ego import (
     with_free,
 )
 from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, side_to_look, start
-from limsim_jax.traffic.motion import CREEP_SPEED, Decision, accelerations, advance, boxes
+from limsim_jax.traffic.motion import CREEP_SPEED, Decision, accelerations, advance, boxes, tails
 from limsim_jax.traffic.neighbors import (
     Ahead,
     Obstacles,
@@ -134,7 +134,7 @@ def decide(
     )
     found = computed_once(found)
     own, second, new = (jax.tree.map(lambda x: x[:, k], found) for k in range(3))  # noqa: B023
-    own = _behind_tails(lane_map, state, own)
+    own = _behind_tails(lane_map, state, ahead, own)
     if traffic.lane_changes:
         choice = choose_lane(
             traffic.model, lane_map, state, v0, own, new, beside, beside_s, allowed, side, turn
@@ -194,23 +194,27 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
     )
 
 
-def _behind_tails(lane_map: LaneMap, state: State, own: Pair) -> Pair:
-    """Leaders of those who leave the map at the end of their lane: also who has left it but for its tail.
+def _behind_tails(lane_map: LaneMap, state: State, ahead: Ahead, own: Pair) -> Pair:
+    """Leaders of those who come to the end of their way: also who has left its last lane but for the tail.
 
     All others see those on their way, or in a split of the ways.
     """
-    ends = lane_map.routes.is_goal[state.lane, state.goal]
-    rear = lane_map.length[state.previous] + state.s - state.shape.length
+    last = lane_map.routes.is_goal[ahead.lane, state.goal[:, None]] & (ahead.lane != NO_LANE)
+    k = jnp.argmax(last, -1)[:, None]
+    end, start = (jnp.take_along_axis(x, k, -1)[:, 0] for x in (ahead.lane, ahead.start))
+    ends = last.any(-1)
+    lane, front = tails(lane_map, state)
+    rear = front - state.shape.length[:, None]
     out = lane_map.length.shape[0]
-    lane = jnp.where(state.active & (state.s < state.shape.length), state.previous, NO_LANE)
     lane = jnp.where(lane == NO_LANE, out, lane)
     least = jnp.full(out, NO_GAP, rear.dtype).at[lane].min(rear, mode="drop")
-    slot = jnp.where(rear == least[state.previous], jnp.arange(lane.shape[0], dtype=own.lead.dtype), -1)
-    last = jnp.full(out, -1, own.lead.dtype).at[lane].max(slot, mode="drop")
-    gap = least[state.lane] - state.s
-    nearer = ends & (last[state.lane] >= 0) & (gap < own.lead_gap) & (gap > -state.shape.length)
+    slot = jnp.arange(lane.shape[0], dtype=own.lead.dtype)[:, None]
+    slot = jnp.where(rear == least.at[lane].get(mode="fill", fill_value=NO_GAP), slot, -1)
+    hindmost = jnp.full(out, -1, own.lead.dtype).at[lane].max(slot, mode="drop")[end]
+    gap = least[end] + start
+    nearer = ends & (hindmost >= 0) & (gap < own.lead_gap) & (gap > -state.shape.length)
     return own._replace(
-        lead=jnp.where(nearer, last[state.lane], own.lead), lead_gap=jnp.where(nearer, gap, own.lead_gap)
+        lead=jnp.where(nearer, hindmost, own.lead), lead_gap=jnp.where(nearer, gap, own.lead_gap)
     )
 
 

@@ -214,6 +214,21 @@ def lateral_speed(state: State) -> Float[Array, " N"]:
     return jnp.where(state.side != 0, -state.shift * slope * rate, 0)
 
 
+def tails(lane_map: LaneMap, state: State) -> tuple[Int[Array, "N 2"], Float[Array, "N 2"]]:
+    """Lanes behind its own on which a vehicle still has its tail, and its front bumper along them, m.
+
+    NO_LANE where it has none. Lanes may be shorter than vehicles, so these are the lane behind and the one
+    behind that; where several lead there, it is not known from which of them a vehicle came.
+    """
+    one = (lane_map.predecessors != NO_LANE).sum(-1) == 1
+    behind = jnp.where(one[state.previous], lane_map.predecessors[state.previous, 0], NO_LANE)
+    lane = jnp.stack([state.previous, jnp.where(state.previous == NO_LANE, NO_LANE, behind)], -1)
+    length = lane_map.length[lane]
+    front = state.s[:, None] + jnp.cumsum(length, -1)
+    there = state.active[:, None] & (front - length < state.shape.length[:, None])
+    return jnp.where(there, lane, NO_LANE), front
+
+
 def boxes(lane_map: LaneMap, state: State) -> Float[Array, "N 5"]:
     """Oriented boxes: x, y (m) of the centre, heading (rad), length, width (m).
 

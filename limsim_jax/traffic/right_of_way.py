@@ -30,6 +30,7 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap, turn_speed
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP
+from limsim_jax.traffic.motion import tails
 from limsim_jax.traffic.neighbors import Ahead, Pair, Shelf
 from limsim_jax.types import Config, Driver, Lights, State
 
@@ -61,6 +62,7 @@ _YELLOW = 2.5  # s of yellow that are counted on
 _OVER_LINE = 2.0  # m beyond the line at which a vehicle that rolls may still stop
 _SLOWS = 1.0  # m/s^2, braking of who may stop inside a junction
 _STANDS = 1.0  # m/s, below which the vehicle ahead counts as standing
+_LONG = 1e3  # s, who is kept by somebody who stands comes at no time that others could tell
 
 
 class Rows(NamedTuple):
@@ -218,15 +220,16 @@ def _meet(
     """
     table, driver = lane_map.conflicts, state.driver
     n, size, slots = state.lane.shape[0], table.length.shape[0], table.foe.shape[1]
-    # tails that are still on the connector behind
-    tail = table.connector[state.previous]
-    tail = jnp.where(state.active & (state.s < state.shape.length), tail, -1)
-    first = jax.tree.map(lambda x: x[:, 0], sight)
-    first = first._replace(y=state.s + lane_map.length[state.previous], line=jnp.full_like(state.s, -NO_GAP))
-    entries = _Sight(
-        *(jnp.concatenate([x, t[:, None]], -1).ravel() for x, t in zip(sight, first, strict=True))
+    # tails that are still on the connector behind, or on the one behind that if lanes are short
+    tail, y = tails(lane_map, state)
+    tail = jnp.where(tail == NO_LANE, -1, table.connector[tail])
+    entries = jax.tree.map(lambda x: jnp.concatenate([x, x[:, :1], x[:, :1]], -1), sight)
+    entries = entries._replace(
+        y=jnp.concatenate([sight.y, y], -1),
+        line=jnp.concatenate([sight.line, jnp.full_like(y, -NO_GAP)], -1),
     )
-    connector = jnp.concatenate([rows.connector, tail[:, None]], -1).ravel()
+    entries = _Sight(*(x.ravel() for x in entries))
+    connector = jnp.concatenate([rows.connector, tail], -1).ravel()
     count = connector.shape[0]
 
     shelf = Shelf(size, count)
@@ -276,30 +279,37 @@ def _meet(
 
     mine, theirs = _Way(s_in, s_out), _Way(f_in, f_out)
     gaps = _gap(driver, state)
-    first = _goes_first(
+    rivals = _compare(
         me, mine, gaps[vehicle][None], other, theirs, gaps[other.slot.astype(jnp.int32)],
         table.prio[k, c][None], table.tie[k, c][None], merges,
     )  # fmt: skip
 
     distance_in = s_in - me.y
     past = s_out + me.length - me.y <= 0
-    waits = computed_once(there & ~first & ~past & ~splits)
     # a vehicle that clears the stretch before one comes there needs no care
     way = f_out + other.length - other.y
     out = travel_time(way, jnp.minimum(other.v, other.slow), other.slow, 0.7 * other.a)
     soon = travel_time(distance_in, me.v, me.fast, me.a)
     halts = (other.stuck > 0) | ((other.slows > 0) & (other.line < -_MARGIN))  # perhaps within the stretch
-    waits &= ~((out + GAP_FOLLOW < soon) & ~halts & ~merges)
+    cares = there & ~past & ~splits & ~((out + GAP_FOLLOW < soon) & ~halts & ~merges)
     # merging: behind the other where there is room behind it, and where that asks for less than to stop
     behind = (s_out - me.y) - (f_out - other.y + other.length)
     s0, T, b = (x[vehicle][None] for x in (driver.s0, driver.T, driver.b))
     reach = behind + other.v * other.v / (2 * b)
     eases = (behind > s0 + 0.5 * T * me.v) & (reach > distance_in)
-    follows = waits & merges & (eases | (distance_in <= -_MARGIN))
+    follows = merges & (eases | (distance_in <= -_MARGIN))
     # keep clear: nobody enters behind a slow vehicle only to stand where others cross
     clear = (table.cross_s[k][None] - me.y) + me.length + s0
     stands = (table.cross_s[k][None] > 0) & (me.line > -_MARGIN) & (other.v < 2 * _STANDS)
     follows &= ~(stands & (behind < clear))
+    cares, follows = computed_once((cares, follows))
+    # how long those who stand are kept by who goes before them in any case: so much later do they come
+    kept = jnp.where(halts | (other.held > 0), _LONG, out)
+    kept = jnp.where(cares & ~follows & ~_goes_first(rivals, 0.0, 0.0), kept, 0).max(0)
+    kept = jnp.zeros(n, jnp.float32).at[vehicle].max(kept)
+    kept = computed_once(jnp.where(state.v < _STANDS, kept, 0))
+    waits = cares & ~_goes_first(rivals, kept[vehicle][None], kept[other.slot.astype(jnp.int32)])
+    follows &= waits
     waits, follows = computed_once((waits, follows))
     taken = (waits & ~follows).any(0)
     until = jnp.where(taken, distance_in[0], NO_GAP)
@@ -336,7 +346,27 @@ def _gap(driver: Driver, state: State) -> Float[Array, " N"]:
     return GAP_LEAD * driver.gap_factor * (1 - 0.6 * impatience)
 
 
-def _goes_first(
+class _Rivals(NamedTuple):
+    """Two vehicles that come to a stretch, as far as both see it alike whatever keeps them."""
+
+    sure: Array  # who goes first is beyond choice: one of them, or both, cannot wait any more
+    forced: Array  # whether `me` goes first then
+    major: Array  # whether `me` has priority
+    mine: _Passage
+    theirs: _Passage
+
+
+class _Passage(NamedTuple):
+    """Whether a vehicle could pass before the other."""
+
+    soon: Array  # s until it comes
+    needs: Array  # s until it has left, and the gap that it keeps
+    ready: Array  # nothing else keeps it
+    kept: Array  # it does not come
+    held: Array  # it stands for the right of way
+
+
+def _compare(
     me: _Sight,
     mine: _Way,
     gap_me: Array,
@@ -346,8 +376,8 @@ def _goes_first(
     prio: Array,
     tie: Array,
     merges: Array,
-) -> Array:
-    """Whether `me` goes before `foe`: the negation of the same with the roles swapped."""  # fmt: skip
+) -> _Rivals:
+    """What decides whether `me` goes before `foe`; with the roles swapped, the opposite."""
     in_me, in_foe = mine.start - me.y, theirs.start - foe.y
     level_me = (in_me <= -_MARGIN).astype(jnp.int32) + (in_me < me.brake).astype(jnp.int32)
     level_foe = (in_foe <= -_MARGIN).astype(jnp.int32) + (in_foe < foe.brake).astype(jnp.int32)
@@ -360,6 +390,7 @@ def _goes_first(
     nearer = jnp.where(left_me == left_foe, before, left_me < left_foe)
     sooner = jnp.where(soon_me == soon_foe, before, soon_me < soon_foe)
     forced = jnp.where(level_me == 2, nearer, sooner)
+    forced = jnp.where(level_me != level_foe, level_me > level_foe, forced)
 
     # between those who can still choose: who has priority
     forced, sooner, level_me, level_foe = computed_once((forced, sooner, level_me, level_foe))
@@ -368,29 +399,48 @@ def _goes_first(
     rank = jnp.where((tie != 0) & (both < WAITED), tie > 0, longer)
     light = jnp.sign(me.major - foe.major)
     order = jnp.where(light != 0, light, prio.astype(light.dtype))
-    kept = (me.held > 0) & (foe.held > 0) & (both > STUCK)
-    major = jnp.where(kept, longer, jnp.where(order != 0, order > 0, rank))
-    # and whether the other has the time to pass before
-    i_pass = _passes(me, mine, gap_me, foe, soon_foe, merges)
-    foe_passes = _passes(foe, theirs, gap_foe, me, soon_me, merges)
-    i_pass, foe_passes = computed_once((i_pass, foe_passes))
-    free = jnp.where(major, ~foe_passes, i_pass)
-    return jnp.where(level_me != level_foe, level_me > level_foe, jnp.where(level_me > 0, forced, free))
+    stuck = (me.held > 0) & (foe.held > 0) & (both > STUCK)
+    major = jnp.where(stuck, longer, jnp.where(order != 0, order > 0, rank))
+    return computed_once(
+        _Rivals(
+            sure=(level_me > 0) | (level_foe > 0),
+            forced=forced,
+            major=major,
+            mine=_passage(me, mine, gap_me, foe, soon_me, merges),
+            theirs=_passage(foe, theirs, gap_foe, me, soon_foe, merges),
+        )
+    )
 
 
-def _passes(minor: _Sight, way: _Way, gap: Array, major: _Sight, soon: Array, merges: Array) -> Array:
-    """Whether `minor` takes the gap in front of `major`, which would arrive in `soon` s."""
-    start = jnp.minimum(minor.v, minor.slow)
-    a = 0.8 * minor.a
+def _passage(who: _Sight, way: _Way, gap: Array, other: _Sight, soon: Array, merges: Array) -> _Passage:
+    """What it takes `who` to pass in front of `other`."""
+    start = jnp.minimum(who.v, who.slow)
+    a = 0.8 * who.a
     # merging, it has to be in front by its length; crossing, to have left
-    distance = jnp.where(merges, way.start, way.end) - minor.y + minor.length
-    out = travel_time(distance, start, minor.slow, a)
-    speed = jnp.minimum(jnp.sqrt(start * start + 2 * a * jnp.maximum(distance, 0)), minor.slow)
-    slower = jnp.maximum(major.v - speed, 0)
-    loss = jnp.where(merges, slower * slower / (4 * jnp.maximum(major.v, 1)), 0)  # major brakes with 2 m/s^2
-    gap = jnp.where(minor.line < 0, 0.3 * gap, gap)  # who has entered goes on
-    comes_not = (major.stuck > 0) | ((major.held > 0) & (minor.held == 0))
-    return (minor.stuck == 0) & (comes_not | (out + gap + loss < soon))
+    distance = jnp.where(merges, way.start, way.end) - who.y + who.length
+    out = travel_time(distance, start, who.slow, a)
+    speed = jnp.minimum(jnp.sqrt(start * start + 2 * a * jnp.maximum(distance, 0)), who.slow)
+    slower = jnp.maximum(other.v - speed, 0)
+    loss = jnp.where(merges, slower * slower / (4 * jnp.maximum(other.v, 1)), 0)  # other brakes with 2 m/s^2
+    gap = jnp.where(who.line < 0, 0.3 * gap, gap)  # who has entered goes on
+    return _Passage(
+        soon=soon, needs=out + gap + loss, ready=who.stuck == 0, kept=who.stuck > 0, held=who.held > 0
+    )
+
+
+def _goes_first(rivals: _Rivals, kept_me: Array | float, kept_foe: Array | float) -> Array:
+    """Whether `me` goes before `foe`, if others keep them for so many seconds."""
+
+    def passes(minor: _Passage, major: _Passage, kept: Array | float) -> Array:
+        later = jnp.where(minor.held, 0.0, kept)
+        return minor.ready & (major.kept | (minor.needs < major.soon + later))
+
+    free = jnp.where(
+        rivals.major,
+        ~passes(rivals.theirs, rivals.mine, kept_me),
+        passes(rivals.mine, rivals.theirs, kept_foe),
+    )
+    return jnp.where(rivals.sure, rivals.forced, free)
 
 
 def _lights(
