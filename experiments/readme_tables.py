@@ -202,7 +202,7 @@ def closed_loop(result: dict[str, Any]) -> str:
         if "left_of_default" not in one:
             continue
         before, after = one["held_out"]["default"], one["held_out"]["closed_loop"]
-        halves, own = one["floor"]["held_out"], one["from_own"]["held_out"]
+        halves, own = one["floor"], one["from_own"]
         cells = [
             f"{100 * one['left_of_default'][name]:.0f} %: {before[name]:.3g} to {after[name]:.3g} {unit} "
             f"({own[name]:.3g}, {halves[name]:.3g})"

@@ -8,9 +8,13 @@ are adjusted until time headways, speeds, gaps and the fundamental diagram have 
 
 The scores of the drivers are the same whatever the population is (common random numbers), and the distance of
 two distributions is the mean distance of their sorted samples (Wasserstein-1), so the loss has gradients by
-the population, through the rollout. Periods are held out; `ClosedLoop` has the distances there, before and
-after, and two yardsticks: how far apart two halves of the recorded vehicles themselves are, and how far a
-record is from the population that made it, which is as near as one comes that is exactly right.
+the population, through the rollout. It is descended from two populations, that of fits to single drivers and
+the simulator's own, to the lower end.
+
+All periods are held out in turns (cross-validation): each is simulated with a population that was fitted
+without it. `ClosedLoop` has the distances of all of them together, before and after, and two yardsticks: how
+far apart two halves of the recorded vehicles themselves are, and how far a record is from the population that
+made it, which is as near as one comes that is exactly right.
 
 What has no gradient is for `matching`.
 """
@@ -19,7 +23,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -34,8 +38,8 @@ from numpy.typing import NDArray
 from scipy.stats import truncnorm, wasserstein_distance
 
 from limsim_jax.calibration.cleaning import Segment, segments
-from limsim_jax.calibration.fit import LOWER, MODELS, PARAMETERS, UPPER, driver
-from limsim_jax.calibration.population import Law, write_population
+from limsim_jax.calibration.fit import LOWER, MODELS, PARAMETERS, UPPER, driver, fit
+from limsim_jax.calibration.population import IDENTIFIED, Law, estimate, write_population
 from limsim_jax.calibration.recordings import RecordingError, Source, as_recording
 from limsim_jax.traffic.car_following import CarFollowing, ballistic
 from limsim_jax.traffic.vehicles import CUT, default_population, sample_vehicles
@@ -64,6 +68,12 @@ speed."""
 
 UNITS = {"headway": "s", "speed": "m/s", "gap": "m", "mean_speed": "m/s", "flow": "veh/h"}
 """Of the distances."""
+
+TURNS = 3
+"""In which periods are held out."""
+
+LEAST = 15.0
+"""s of a follower, of which shorter periods have cut a part, for a fit of its own."""
 
 _SHORT = 1.0  # s, shorter segments are left out
 _EVERY = 1.0  # s between the samples of a vehicle that are compared
@@ -96,6 +106,7 @@ class Linked(NamedTuple):
     who: NDArray[np.int64]  # [W V], driver of the row
     periods: tuple[str, ...]  # names, [W]
     sources: tuple[str, ...]  # files, [W]
+    spans: NDArray[np.float64]  # s, [W 2], begin and end in the time of the file
     dt: float  # s
     counts: NDArray[np.bool_]  # [W T V], what is compared
     slice: NDArray[np.int64]  # [W T V], which point of the fundamental diagram it belongs to
@@ -149,11 +160,12 @@ def link(found: Sequence[Segment], *, period: float = PERIOD, settle: float = SE
             at = end
     wide = max(len({piece.driver for piece, _ in pieces}) for pieces in windows.values())
     who = np.zeros((len(windows), wide), np.int64)
-    parts = []
-    for k, ((source, _), pieces) in enumerate(sorted(windows.items())):
+    parts, spans = [], []
+    for k, ((source, window), pieces) in enumerate(sorted(windows.items())):
         rows = {name: i for i, name in enumerate(dict.fromkeys(piece.driver for piece, _ in pieces))}
         who[k, : len(rows)] = [index[source, name] for name in rows]
         parts.append(_window(pieces, rows, (length, wide), dt))
+        spans.append((begins[source] + window * period, begins[source] + (window + 1) * period))
     chains = Chains(*(np.stack(leaves) for leaves in zip(*parts, strict=True)))  # pyright: ignore[reportArgumentType]
     counts, point = _samples(chains, dt, min(settle, period / 4))
     if not counts.any():
@@ -162,7 +174,9 @@ def link(found: Sequence[Segment], *, period: float = PERIOD, settle: float = SE
         )
     sources = tuple(source for source, _ in sorted(windows))
     periods = tuple(f"{Path(source).name.split('.')[0]} {k * period:g} s" for source, k in sorted(windows))
-    linked = Linked(chains, tuple(name for _, name in names), who, periods, sources, dt, counts, point)
+    linked = Linked(
+        chains, tuple(name for _, name in names), who, periods, sources, np.array(spans), dt, counts, point
+    )
     return linked.part(np.flatnonzero(counts.any(axis=(1, 2))).tolist())
 
 
@@ -501,24 +515,31 @@ def _moved(mean: Array, root: Array, point: _Point) -> tuple[Array, Array]:
 class ClosedLoop:
     """Result of `calibrate_closed_loop`; distances by population: `default`, `start` and `closed_loop`."""
 
-    law: Law  # the adjusted population
-    start: Law
+    law: Law  # the adjusted population, of all periods
+    start: Law  # of fits to single drivers
     model: str
     sources: tuple[str, ...]  # files
-    periods: tuple[tuple[str, ...], tuple[str, ...]]  # names of those fitted and of those held out
-    fitted: dict[str, Distances]  # of the periods of the fit
-    held_out: dict[str, Distances]
-    floors: tuple[Distances, Distances]  # between halves of the recorded drivers, in both
-    from_own: tuple[Distances, Distances]  # of records made by the adjusted population from it, in both
+    folds: tuple[tuple[str, ...], ...]  # names of the periods that were held out together
+    fitted: dict[str, Distances]  # of the populations of all periods
+    held_out: dict[str, Distances]  # of each period from those fitted without it
+    floor: Distances  # between halves of the recorded drivers
+    from_own: Distances  # of a record made by the adjusted populations from them
     overlaps: dict[str, float]  # share of the samples held out in which bodies overlap
-    samples: tuple[int, int]
+    samples: int
     losses: Floats  # of every iteration
     seconds: float
 
     def falls(self) -> dict[str, float]:
         """What is left of each distance from the default population, on held-out periods: 0.5 is a half."""
-        before, after = self.held_out["default"], self.held_out["closed_loop"]
-        return {name: float(getattr(after, name) / getattr(before, name)) for name in Distances._fields}
+        return self._of_default(self.held_out["closed_loop"])
+
+    def reachable(self) -> dict[str, float]:
+        """What would be left if the population were exactly right: as far as the record has it, the least."""
+        return self._of_default(self.from_own)
+
+    def _of_default(self, found: Distances) -> dict[str, float]:
+        before = self.held_out["default"]
+        return {name: float(getattr(found, name) / getattr(before, name)) for name in Distances._fields}
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -529,13 +550,14 @@ class ClosedLoop:
         return {
             "model": self.model,
             "units": UNITS,
-            "periods": {"fitted": list(self.periods[0]), "held_out": list(self.periods[1])},
-            "samples": list(self.samples),
+            "folds": [list(names) for names in self.folds],
+            "samples": self.samples,
             "fitted": {name: plain(x) for name, x in self.fitted.items()},
             "held_out": {name: plain(x) for name, x in self.held_out.items()},
-            "floor": {"fitted": plain(self.floors[0]), "held_out": plain(self.floors[1])},
-            "from_own": {"fitted": plain(self.from_own[0]), "held_out": plain(self.from_own[1])},
+            "floor": plain(self.floor),
+            "from_own": plain(self.from_own),
             "left_of_default": self.falls(),
+            "reachable": self.reachable(),
             "overlaps": self.overlaps,
             "population": {
                 name: {"median": law.median, "spread": law.spread}
@@ -548,21 +570,23 @@ class ClosedLoop:
     def text(self) -> str:
         """For the terminal."""
         lines = [
-            f"closed loop, {self.model.upper()}: {len(self.periods[0])} periods fitted, "
-            f"{len(self.periods[1])} held out ({self.samples[0]} and {self.samples[1]} samples)",
+            f"closed loop, {self.model.upper()}: {sum(map(len, self.folds))} periods, held out in "
+            f"{len(self.folds)} turns ({self.samples} samples)",
             f"{'':34}" + "".join(f"{f'{name}, {UNITS[name]}':>18}" for name in Distances._fields),
         ]
-        for where, found, least, own in (
-            ("fitted", self.fitted, self.floors[0], self.from_own[0]),
-            ("held out", self.held_out, self.floors[1], self.from_own[1]),
-        ):
-            rows = [("default drivers", found["default"]), ("fits of single drivers", found["start"])]
-            rows += [("closed loop", found["closed_loop"]), ("between halves of the record", least)]
-            rows += [("of a record of its own", own)]
-            for name, row in rows:
-                lines.append(f"{f'{where}, {name}':38}" + "".join(f"{float(x):>16.3f}  " for x in row)[4:])
-        left = ", ".join(f"{name} {share:.0%}" for name, share in self.falls().items())
-        lines.append(f"left of the default drivers' distances, held out: {left}")
+        names = {
+            "default": "default drivers",
+            "start": "fits of single drivers",
+            "closed_loop": "closed loop",
+        }
+        rows = [(f"fitted, {names[key]}", row) for key, row in self.fitted.items()]
+        rows += [(f"held out, {names[key]}", row) for key, row in self.held_out.items()]
+        rows += [("between halves of the record", self.floor), ("of a record of its own", self.from_own)]
+        for name, row in rows:
+            lines.append(f"{name:38}" + "".join(f"{float(x):>16.3f}  " for x in row)[4:])
+        of = self.reachable()
+        left = ", ".join(f"{name} {share:.0%} ({of[name]:.0%})" for name, share in self.falls().items())
+        lines.append(f"left of the default drivers' distances, held out (if exactly right): {left}")
         values = ", ".join(
             f"{name} {self.law.median[name]:.2f} x/ {np.exp(self.law.spread[name]):.2f}"
             for name in PARAMETERS
@@ -580,32 +604,52 @@ class ClosedLoop:
         write_population(self.law, path, sources=self.sources, classes=classes, speed_limit=speed_limit)
 
 
-def hold_out(linked: Linked, share: float = 0.6) -> tuple[list[int], list[int]]:
-    """Periods to fit and to hold out: of every recording the first `share` and the rest.
+def hold_out(linked: Linked, turns: int = TURNS) -> list[list[int]]:
+    """Periods to hold out in turns: of every recording one stretch each time.
 
-    Recordings of one period only are fitted and held out in turns.
+    Recordings of fewer periods than turns are held out period by period, in turns over all of them.
 
     Raises:
-      ValueError: nothing is left to hold out.
+      ValueError: nothing is left to fit.
     """
     of: dict[str, list[int]] = {}
     for k, source in enumerate(linked.sources):
         of.setdefault(source, []).append(k)
-    early, late, single = [], [], []
+    found: list[list[int]] = [[] for _ in range(turns)]
+    short: list[int] = []
     for these in of.values():
-        if len(these) == 1:
-            single += these
+        if len(these) < turns:
+            short += these
             continue
-        cut = min(max(round(share * len(these)), 1), len(these) - 1)
-        early += these[:cut]
-        late += these[cut:]
-    early, late = sorted(early + single[::2]), sorted(late + single[1::2])
-    if not late:
+        for turn, some in enumerate(np.array_split(these, turns)):
+            found[turn] += some.tolist()
+    for i, k in enumerate(short):
+        found[i % turns].append(k)
+    found = [sorted(some) for some in found if some]
+    if len(found) < 2:
         raise ValueError(
             f"one period only ({linked.periods[0]}); a shorter 'period' or another recording is needed "
             "to hold one out"
         )
-    return early, late
+    return found
+
+
+def outside(found: Sequence[Segment], linked: Linked, periods: Sequence[int]) -> list[Segment]:
+    """What of the segments is not in these periods: parts of at least `LEAST` s, or as long as they were."""
+    spans = {source: [] for source in linked.sources}
+    for k in periods:
+        spans[linked.sources[k]].append(linked.spans[k])
+    left = []
+    for segment in found:
+        at = segment.time + segment.dt * (np.arange(len(segment)) + 1e-3)
+        keep = np.ones(len(segment), bool)
+        for begin, end in spans.get(segment.source, []):
+            keep &= (at < begin) | (at >= end)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(int)))
+        least = min(LEAST, segment.duration) - 1.5 * segment.dt
+        parts = [segment.part(i, j) for i, j in zip(edges[::2], edges[1::2], strict=True)]
+        left += [part for part in parts if part.duration >= least]
+    return left
 
 
 def linked_recordings(
@@ -628,12 +672,18 @@ def linked_recordings(
     return link(found, period=period, settle=settle)
 
 
+def single_fits(found: Sequence[Segment]) -> Law:
+    """The population of fits of the IDM to single drivers."""
+    return estimate(fit(found, "idm", starts=4), found, rounds=1)
+
+
 def calibrate_closed_loop(
     linked: Linked,
-    start: Law,
+    found: Sequence[Segment],
     *,
+    population: Callable[[Sequence[Segment]], Law] = single_fits,
     model: str = "acc",
-    share: float = 0.6,
+    turns: int = TURNS,
     speed_limit: float = SPEED_LIMIT,
     draws: int = 8,
     iterations: int = 120,
@@ -644,17 +694,18 @@ def calibrate_closed_loop(
 
     Args:
       linked: from `linked_recordings`.
-      start: the population to start from, and to stay near: from `population.estimate`.
+      found: followers of the same recordings, from `report.gather`.
+      population: of followers, to start from; called with those of the periods of each fit.
       model: that drives: "idm", "iidm", or "acc" as the simulator by default.
-      share: see `hold_out`.
-      speed_limit: m/s, for the default population that the result is compared with.
+      turns: see `hold_out`.
+      speed_limit: m/s, for the default population, and for desired speeds that the data do not tell.
       draws: simulations with other drivers, in the fit; twice as many others, in the comparison.
-      iterations: of Adam.
+      iterations: of Adam, from each of two populations.
       seed: of the drivers' scores.
       weights: of distances, instead of those in `WEIGHTS`.
 
     Raises:
-      ValueError: an unknown model or distance, or nothing to hold out.
+      ValueError: an unknown model or distance, fewer than three drivers, or nothing to hold out.
     """
     begin = time.perf_counter()
     if model not in MODELS:
@@ -662,50 +713,90 @@ def calibrate_closed_loop(
     for name in weights or {}:
         if name not in Distances._fields:
             raise ValueError(f"distance '{name}' is unknown; known are {', '.join(Distances._fields)}")
-    split = hold_out(linked, share)
-    parts = [linked.part(periods) for periods in split]
-    recorded = [samples(part) for part in parts]
-    points = [int(one.point.max()) + 1 for one in recorded]
-    fields = [jax.tree.map(jnp.asarray, part.chains) for part in parts]
-    drive = MODELS[model]
-    mean = jnp.asarray(start.mean, jnp.float32)
-    root = jnp.asarray(np.linalg.cholesky(start.covariance), jnp.float32)
-    count = len(linked.drivers)
-    scale = _scale(recorded[0], WEIGHTS | dict(weights or {}))
-    point, losses = _descend(
-        drive, mean, root, scores(draws, count, seed), fields[0], recorded[0], scale, linked.dt, points[0],
-        iterations,
-    )  # fmt: skip
-    after = _moved(mean, root, point)
+    folds = hold_out(linked, turns)
+    drive, count, every = MODELS[model], len(linked.drivers), range(len(linked.periods))
     z = scores(2 * draws, count, seed + 1)
-    drivers = {
-        "default": default_drivers(2 * draws, count, seed + 1, speed_limit),
-        "start": drawn(mean, root, z),
-        "closed_loop": drawn(*after, z),
-    }
-    apart, own, overlaps = [], [], {}
-    for chains, log, n in zip(fields, recorded, points, strict=True):
-        made = {name: simulate_samples(drive, p, chains, log, linked.dt) for name, p in drivers.items()}
-        apart.append({name: _on_host(distances(log, *both, n)) for name, both in made.items()})
-        own.append(_on_host(from_own(log, *made["closed_loop"], n)))
-        overlaps = {name: float(jnp.mean(gap <= 0)) for name, (gap, _) in made.items()}
-    factor = np.asarray(after[1], float)
-    law = replace(start, mean=np.asarray(after[0], float), covariance=factor @ factor.T, model=model)
+    default = default_drivers(2 * draws, count, seed + 1, speed_limit)
+
+    def fitted(periods: Sequence[int]) -> tuple[Law, Law, Floats]:
+        """Populations of these periods: of single fits, and in closed loop; the losses."""
+        start = population(outside(found, linked, sorted(set(every) - set(periods))))
+        part = linked.part(periods)
+        recorded = samples(part)
+        chains = jax.tree.map(jnp.asarray, part.chains)
+        scale = _scale(recorded, WEIGHTS | dict(weights or {}))
+        ends = []
+        for mean, root in _starts(start, speed_limit):
+            point, losses = _descend(
+                drive, mean, root, scores(draws, count, seed), chains, recorded, scale, linked.dt,
+                int(recorded.point.max()) + 1, iterations,
+            )  # fmt: skip
+            ends.append((float(jnp.min(losses)), _moved(mean, root, point), losses))
+        _, (mean, root), losses = min(ends, key=lambda end: end[0])
+        factor = np.asarray(root, float)
+        law = replace(start, mean=np.asarray(mean, float), covariance=factor @ factor.T, model=model)
+        return start, law, np.asarray(losses, float)
+
+    def simulated(laws: tuple[Law, Law], periods: Sequence[int]) -> dict[str, tuple[Floats, Floats]]:
+        """Gaps and speeds `[K M]` of these periods, by population."""
+        part = linked.part(periods)
+        recorded, chains = samples(part), jax.tree.map(jnp.asarray, part.chains)
+        drivers = {"default": default}
+        for name, law in zip(("start", "closed_loop"), laws, strict=True):
+            root = np.linalg.cholesky(law.covariance)
+            drivers[name] = drawn(*(jnp.asarray(x, jnp.float32) for x in (law.mean, root)), z)
+        return {
+            name: jax.device_get(simulate_samples(drive, p, chains, recorded, linked.dt))
+            for name, p in drivers.items()
+        }
+
+    log = samples(linked)
+    points = int(log.point.max()) + 1
+    of = np.asarray(log.at) // math.prod(linked.counts.shape[1:])  # period of each sample
+    start, law, losses = fitted(every)
+    all_fitted = simulated((start, law), every)
+    held_out = jax.tree.map(np.zeros_like, all_fitted)
+    for periods in folds:
+        laws = fitted(sorted(set(every) - set(periods)))[:2]
+        for name, both in simulated(laws, periods).items():
+            for values, x in zip(held_out[name], both, strict=True):
+                values[:, np.isin(of, periods)] = x
+
+    def apart(made: Mapping[str, tuple[Floats, Floats]]) -> dict[str, Distances]:
+        return {name: _on_host(distances(log, *both, points)) for name, both in made.items()}
+
     return ClosedLoop(
         law=law,
         start=start,
         model=model,
         sources=tuple(dict.fromkeys(linked.sources)),
-        periods=(parts[0].periods, parts[1].periods),
-        fitted=apart[0],
-        held_out=apart[1],
-        floors=(floor(parts[0]), floor(parts[1])),
-        from_own=(own[0], own[1]),
-        overlaps=overlaps,  # of the last: the periods held out
-        samples=(len(recorded[0].at), len(recorded[1].at)),
-        losses=np.asarray(losses, float),
+        folds=tuple(tuple(linked.periods[k] for k in periods) for periods in folds),
+        fitted=apart(all_fitted),
+        held_out=apart(held_out),
+        floor=floor(linked),
+        from_own=_on_host(from_own(log, *held_out["closed_loop"], points)),
+        overlaps={name: float(np.mean(gap <= 0)) for name, (gap, _) in held_out.items()},
+        samples=len(log.at),
+        losses=losses,
         seconds=time.perf_counter() - begin,
     )
+
+
+def _starts(law: Law, speed_limit: float) -> list[tuple[Array, Array]]:
+    """Means and roots of the covariances of log-parameters to start from: this population, the simulator's.
+
+    Of desired speeds that few of the drivers tell, as in congestion, the simulator's are taken in both.
+    """
+    usual = np.log(np.asarray(default_drivers(64, 64, 0, speed_limit), float)).reshape(-1, len(PARAMETERS))
+    mean, covariance = usual.mean(axis=0), np.cov(usual.T) + 1e-6 * np.eye(len(PARAMETERS))
+    own_mean, own = law.mean.copy(), law.covariance.copy()
+    if law.identified[0] <= IDENTIFIED:
+        own_mean[0], own[0], own[:, 0] = mean[0], 0.0, 0.0
+        own[0, 0] = covariance[0, 0]
+    return [
+        (jnp.asarray(m, jnp.float32), jnp.asarray(np.linalg.cholesky(c), jnp.float32))
+        for m, c in ((own_mean, own), (mean, covariance))
+    ]
 
 
 def _on_host(found: Distances) -> Distances:
@@ -737,9 +828,11 @@ __all__ = [
     "hold_out",
     "link",
     "linked_recordings",
+    "outside",
     "samples",
     "scores",
     "simulate",
     "simulate_samples",
+    "single_fits",
     "wasserstein",
 ]

@@ -48,6 +48,9 @@ from limsim_jax.traffic.population_file import FORMAT
 WIDTH = 0.3
 """Standard deviation of log-parameters that is assumed with the weight of `_WEIGHT` drivers."""
 
+IDENTIFIED = 0.5
+"""Share of the drivers whose data tell their desired speed, above which those of a population count."""
+
 _WEIGHT = 4.0
 _HARD = 3.0  # m/s^2, more is no noise but a model that does not fit
 _LAGS = np.arange(0.5, 3.01, 0.5)  # s
@@ -357,7 +360,7 @@ def write_population(
     """
     names = ["T", "s0", "a", "b"]
     rename = {}
-    if law.identified[0] > 0.5:
+    if law.identified[0] > IDENTIFIED:
         names = ["v0", *names]
         rename["v0"] = "speed_factor" if speed_limit else "v_max"
     at = [PARAMETERS.index(name) for name in names]

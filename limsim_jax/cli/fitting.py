@@ -56,7 +56,10 @@ def calibrate(
         hold_out,
         linked_recordings,
     )
+    from limsim_jax.calibration.fit import fit as single
+    from limsim_jax.calibration.population import estimate
     from limsim_jax.calibration.report import calibrate as fit
+    from limsim_jax.calibration.report import gather
     from limsim_jax.files import write_whole
     from limsim_jax.rollout import enable_compilation_cache
 
@@ -73,8 +76,16 @@ def calibrate(
     if linked is not None:
         if found.law is None:
             raise ValueError(f"a population from {len(found.fit.drivers)} drivers; at least 3 are needed")
+        followers, _ = gather(data, shortest=shortest)
         result = calibrate_closed_loop(
-            linked, found.law, model=model, speed_limit=speed_limit or SPEED_LIMIT, seed=seed
+            linked,
+            followers,
+            population=lambda some: estimate(
+                single(some, model, objective=objective, method=method, seed=seed), some, rounds=1
+            ),
+            model=model,
+            speed_limit=speed_limit or SPEED_LIMIT,
+            seed=seed,
         )
         print(f"\n{result.text()}")
         content["closed_loop"] = result.as_json()

@@ -300,8 +300,10 @@ class _LaneGraph:
             return np.array(found, int).reshape(-1, 2)
 
         self.ahead = links([(lane.id, name) for lane in self.lanes for name in lane.successors])
-        self.left = links([(lane.id, lane.left) for lane in self.lanes if lane.may_change_left])
-        self.right = links([(lane.id, lane.right) for lane in self.lanes if lane.may_change_right])
+        # nobody changes lanes within a junction, see `traffic.lane_change.place_beside`
+        outside = [lane for lane in self.lanes if lane.junction is None]
+        self.left = links([(lane.id, lane.left) for lane in outside if lane.may_change_left])
+        self.right = links([(lane.id, lane.right) for lane in outside if lane.may_change_right])
         # Lanes side by side count with their mean length: else a route would change lanes at every
         # bend to save some metres, and long before it must.
         beside = links([(lane.id, name) for lane in self.lanes for name in (lane.left, lane.right)])

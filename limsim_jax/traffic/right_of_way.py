@@ -303,12 +303,20 @@ def _meet(
     stands = (table.cross_s[k][None] > 0) & (me.line > -_MARGIN) & (other.v < 2 * _STANDS)
     follows &= ~(stands & (behind < clear))
     cares, follows = computed_once((cares, follows))
+
+    def both(x: Array) -> tuple[Array, Array]:
+        return x[vehicle][None], x[other.slot.astype(jnp.int32)]
+
+    # who has come to stand where others cross goes before all that can still wait
+    across = there & ~merges & ~splits & (distance_in < 0) & ~past
+    blocks = jnp.zeros(n, bool).at[vehicle].max(across.any(0))
+    blocks = both(computed_once(blocks & (state.v < _STANDS) & (state.waiting > WAITED)))
     # how long those who stand are kept by who goes before them in any case: so much later do they come
     kept = jnp.where(halts | (other.held > 0), _LONG, out)
-    kept = jnp.where(cares & ~follows & ~_goes_first(rivals, 0.0, 0.0), kept, 0).max(0)
+    kept = jnp.where(cares & ~follows & ~_goes_first(rivals, blocks), kept, 0).max(0)
     kept = jnp.zeros(n, jnp.float32).at[vehicle].max(kept)
     kept = computed_once(jnp.where(state.v < _STANDS, kept, 0))
-    waits = cares & ~_goes_first(rivals, kept[vehicle][None], kept[other.slot.astype(jnp.int32)])
+    waits = cares & ~_goes_first(rivals, blocks, both(kept))
     follows &= waits
     waits, follows = computed_once((waits, follows))
     taken = (waits & ~follows).any(0)
@@ -428,18 +436,17 @@ def _passage(who: _Sight, way: _Way, gap: Array, other: _Sight, soon: Array, mer
     )
 
 
-def _goes_first(rivals: _Rivals, kept_me: Array | float, kept_foe: Array | float) -> Array:
-    """Whether `me` goes before `foe`, if others keep them for so many seconds."""
+def _goes_first(
+    rivals: _Rivals, blocks: tuple[Array, Array], kept: tuple[Array, Array] | None = None
+) -> Array:
+    """Whether `me` goes before `foe`, given whether they block others and for how many s others keep them."""
 
-    def passes(minor: _Passage, major: _Passage, kept: Array | float) -> Array:
-        later = jnp.where(minor.held, 0.0, kept)
-        return minor.ready & (major.kept | (minor.needs < major.soon + later))
+    def passes(minor: _Passage, major: _Passage, later: Array | float) -> Array:
+        return minor.ready & (major.kept | (minor.needs < major.soon + jnp.where(minor.held, 0.0, later)))
 
-    free = jnp.where(
-        rivals.major,
-        ~passes(rivals.theirs, rivals.mine, kept_me),
-        passes(rivals.mine, rivals.theirs, kept_foe),
-    )
+    me, foe = (0.0, 0.0) if kept is None else kept
+    major = jnp.where(blocks[0] != blocks[1], blocks[0], rivals.major)
+    free = jnp.where(major, ~passes(rivals.theirs, rivals.mine, me), passes(rivals.mine, rivals.theirs, foe))
     return jnp.where(rivals.sure, rivals.forced, free)
 
 
