@@ -69,13 +69,65 @@ def test_of_two_vehicles_exactly_one_goes_first(merges):
     gap = jnp.asarray(rng.uniform(0.5, 2, (2, n)), jnp.float32)
     prio, tie = (jnp.asarray(rng.integers(-1, 2, n), jnp.int32) for _ in range(2))
     kind = jnp.full(n, merges)
-    one = right_of_way._goes_first(me, mine, gap[0], foe, theirs, gap[1], prio, tie, kind)
-    other = right_of_way._goes_first(foe, theirs, gap[1], me, mine, gap[0], -prio, -tie, kind)
-    np.testing.assert_array_equal(np.asarray(one), ~np.asarray(other))
+    one = right_of_way._compare(me, mine, gap[0], foe, theirs, gap[1], prio, tie, kind)
+    other = right_of_way._compare(foe, theirs, gap[1], me, mine, gap[0], -prio, -tie, kind)
+    free = jnp.zeros(n, bool)
+    blocks = tuple(jnp.asarray(rng.random(n) < 0.3) for _ in range(2))
+    kept = tuple(jnp.asarray(rng.choice([0.0, 3.0, 1e3], n), jnp.float32) for _ in range(2))
+    for situation in (((free, free),), (blocks,), (blocks, kept)):
+        first = right_of_way._goes_first(one, *situation)
+        second = right_of_way._goes_first(other, *(x[::-1] for x in situation))
+        np.testing.assert_array_equal(np.asarray(first), ~np.asarray(second))
+    one = right_of_way._goes_first(one, (free, free))
     assert 0.3 < np.asarray(one).mean() < 0.7
     # who is on the stretch goes before who is not
     on, off = np.asarray(mine.start - me.y) <= -0.5, np.asarray(theirs.start - foe.y) > np.asarray(foe.brake)
     assert np.asarray(one)[on & off].all() and (on & off).sum() > 100
+
+
+def meeting(me, foe, *, prio=1, **same):
+    """Two vehicles before a crossing of their paths; whether the first goes first."""
+    usual = {
+        "y": 0.0, "length": 4.5, "v": 0.0, "fast": 10.0, "slow": 10.0, "a": 1.5, "brake": 0.0, "wait": 0.0,
+        "line": 0.5, "stuck": 0.0, "held": 0.0, "slows": 0.0, "major": 0.0,
+    }  # fmt: skip
+    sights = [
+        right_of_way._Sight(**{k: jnp.float32(x) for k, x in (usual | own | {"slot": k}).items()})
+        for k, own in enumerate((me, foe))
+    ]
+    sights = [x._replace(brake=x.v * x.v / 8) for x in sights]
+    way = right_of_way._Way(jnp.float32(8.0), jnp.float32(16.0))
+    rivals = right_of_way._compare(
+        sights[0], way, jnp.float32(1.5), sights[1], way, jnp.float32(1.5), jnp.int32(prio), jnp.int32(0),
+        jnp.bool_(False),
+    )  # fmt: skip
+
+    def first(blocks=(False, False), kept=None):
+        kept = None if kept is None else tuple(jnp.float32(x) for x in kept)
+        return bool(right_of_way._goes_first(rivals, tuple(jnp.bool_(x) for x in blocks), kept))
+
+    return first
+
+
+def test_who_has_priority_and_stands_is_passed_only_by_who_is_gone_before_it_can_go():
+    """One that is held while lower streams pass must not be held by those that could only come later."""
+    stands = {"held": 1.0, "wait": 30.0}
+    far, near = {"y": -60.0, "v": 12.0, "fast": 12.0, "slow": 12.0}, {"y": -2.0, "v": 7.0}
+    # nobody keeps it: it goes before all that can still stop, though it is held at the moment
+    assert meeting(stands, far)() and meeting(stands, near)(kept=(0.0, 0.0))
+    # others keep it for 3 s: who is near is gone by then, who is far is not
+    assert not meeting(stands, near)(kept=(3.0, 0.0)) and meeting(stands, far)(kept=(3.0, 0.0))
+    # kept by one that stands it comes at no known time: all that are not held themselves may pass
+    assert not meeting(stands, far)(kept=(1e3, 0.0))
+    assert meeting(stands, near | {"held": 1.0, "v": 0.0})(kept=(1e3, 0.0))
+
+
+def test_who_stands_where_others_cross_goes_before_who_can_still_wait():
+    inside, comes = {"line": -5.0, "held": 1.0}, {"y": -25.0, "v": 9.0}
+    assert not meeting(inside, comes, prio=-1)() and meeting(inside, comes, prio=-1)(blocks=(True, False))
+    assert not meeting(inside, comes, prio=-1)(blocks=(True, True))
+    # but not before who can no longer stop
+    assert not meeting(inside, comes | {"y": 7.0}, prio=-1)(blocks=(True, False))
 
 
 def rows_of(line, n):

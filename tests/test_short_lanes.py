@@ -13,10 +13,11 @@ from traffic_worlds import bundled, drivers, shapes
 
 from limsim_jax.geometry import box_separation
 from limsim_jax.maps.lane_map import build_lane_map, lane_rows
+from limsim_jax.maps.network import ImportReport
 from limsim_jax.traffic.demand import start_state
 from limsim_jax.traffic.engine import Command, Traffic, _until_changed, drive
 from limsim_jax.traffic.lane_change import place_beside
-from limsim_jax.traffic.motion import boxes
+from limsim_jax.traffic.motion import boxes, tails
 from limsim_jax.types import Config
 
 CUT = 10.0  # m of the turn in its first piece: it has parted from the straight way by 0.8 m there
@@ -96,8 +97,9 @@ def test_everybody_sees_far_enough():
 def test_no_lane_change_begins_that_the_road_has_no_room_for(v):
     """The road of 2 m goes on beside, but the junction after it does not."""
     _, lane_map, _ = town()
-    time = float(drivers(1).lane_change_time[0])
-    needed = max(v, 5.0) * time
+    time, b = (float(x[0]) for x in (drivers(1).lane_change_time, drivers(1).b))
+    mean = max(v - b * time / 2, v / 2)  # it may brake gently to be done in time
+    needed = max(mean, 5.0) * time
     for s, expected in ((102.0 - needed - 1, True), (102.0 - needed + 1, False)):
         state = vehicles(["in"], [s], [v], ["out_left"])
         assert bool(place_beside(lane_map, state, jnp.ones(1, jnp.int32))[2][0]) == expected
@@ -116,6 +118,112 @@ def test_who_changes_lanes_is_done_before_they_part():
     found = np.asarray(_until_changed(lane_map, half))
     assert found[0] == pytest.approx(32 / (0.5 * time), rel=1e-5) and found[1] > 1e5
     assert found[2] == pytest.approx(72 / (0.5 * time), rel=1e-5)  # has crossed: its old lane is to the right
+
+
+def test_who_has_little_room_brakes_and_has_changed_lanes_before_they_part():
+    _, lane_map, _ = town()
+    time, b = (float(x[0]) for x in (drivers(1).lane_change_time, drivers(1).b))
+    room = max(12.0 - b * time / 2, 6.0) * time + 2
+    state = vehicles(["in", "in"], [102.0 - room, 20.0], [12.0, 12.0], ["out_left", "out"])
+
+    @jax.jit
+    def run(state):
+        def decision(state, _):
+            after, _ = drive(Config(dt=0.1), Traffic(), lane_map, state)
+            return after, (after.lane, after.side, after.v)
+
+        return jax.lax.scan(decision, state, None, length=24)[1]
+
+    lane, side, v = (np.asarray(x)[:, 0] for x in run(state))
+    _, _, rows = town()
+    assert (side > 0).any() and v.min() < 11
+    done = np.flatnonzero((side == 0) & (lane != rows["in"]) & (lane != rows["stub"]))
+    assert len(done) and rows["first"] not in lane and rows["through"] not in lane
+    assert lane[done[0]] in (rows["in_left"], rows["stub_left"], rows["through_left"])
+
+
+def test_tails_are_on_lanes_behind_as_far_as_the_vehicle_is_long():
+    _, lane_map, rows = town()
+    names = ["away3", "away1", "second", "out", "stub", "in"]
+    before = ["away2", "away", "first", "through", "in", None]
+    state = vehicles(names, [0.6, 0.5, 3.0, 9.0, 1.0, 40.0], [0.0] * 6, ["far"] * 3 + ["out"] * 3)
+    previous = [-1 if name is None else rows[name] for name in before]
+    state = dataclasses.replace(state, previous=jnp.asarray(previous, jnp.int32))
+    length = state.shape.length[0]
+    assert 4 < float(length) < 5.5
+    lane, front = (np.asarray(x) for x in tails(lane_map, state))
+    here = [[name and rows[name] for name in pair] for pair in (
+        ("away2", "away1"), ("away", "second"), ("first", None), (None, None), ("in", None), (None, None)
+    )]  # fmt: skip
+    assert lane.tolist() == [[-1 if x is None else x for x in pair] for pair in here]
+    at = np.asarray(lane_map.length)
+    assert front[0].tolist() == pytest.approx([1.6, 2.6])
+    assert front[1].tolist() == pytest.approx([1.5, 1.5 + at[rows["second"]]])
+    assert front[2, 0] == pytest.approx(3.0 + at[rows["first"]])
+
+
+def test_who_waits_behind_a_short_road_is_seen_by_those_whose_way_its_tail_is_on():
+    """One stands on the road of 2 m after a crossing with its tail on the crossing, two lanes back."""
+    lanes = [
+        straight("west", (-60, 0), 0.0, 60.0, successors=("cross",)),
+        straight("cross", (0, 0), 0.0, 8.0, junction="J", successors=("bit",)),
+        straight("bit", (8, 0), 0.0, 0.5, successors=("piece",)),
+        straight("piece", (8.5, 0), 0.0, 0.5, successors=("east",)),
+        straight("east", (9.0, 0), 0.0, 60.0),
+        straight("south", (6, -60), math.pi / 2, 56.0, successors=("up",)),
+        straight("up", (6, -4), math.pi / 2, 8.0, junction="J", successors=("north",)),
+        straight("north", (6, 4), math.pi / 2, 60.0),
+    ]
+    net = network(lanes)
+    lane_map, rows = build_lane_map(net), lane_rows(net)
+    is_goal = np.asarray(lane_map.routes.is_goal)
+    state = start_state(
+        lane_map, drivers(2), shapes(2), lane=jnp.asarray([rows["piece"], rows["south"]]),
+        s=jnp.asarray([0.3, 20.0]), v=jnp.asarray([0.0, 9.0]),
+        goal=jnp.asarray([int(np.argmax(is_goal[rows[x]])) for x in ("east", "north")]), active=None,
+    )  # fmt: skip
+    state = dataclasses.replace(state, previous=jnp.asarray([rows["bit"], -1], jnp.int32))
+    brake = jnp.asarray([True, False])
+
+    @jax.jit
+    def run(state):
+        def decision(state, _):
+            state, _ = drive(Config(dt=0.1), Traffic(), lane_map, state, command=Command(brake=brake))
+            return state, (state.v[1], state.status)
+
+        return jax.lax.scan(decision, state, None, length=30)[1]
+
+    v, status = run(state)
+    assert float(v[-1]) == 0.0 and not np.asarray(status).any()
+
+
+def test_nobody_leaps_to_a_lane_that_begins_beside():
+    """Two lanes go on as one: who is on the one that ends beside it changes lanes before."""
+
+    def two(offset, beside=True):
+        left, right = ({"left": "in_left"}, {"right": "in"}) if beside else ({}, {})
+        return network([
+            straight("in", (0, 0), 0.0, 100.0, successors=("out",), may_change_left=True, **left),
+            straight(
+                "in_left", (0, offset), 0.0, 100.0, successors=("out", "turn"), may_change_right=True, **right
+            ),
+            straight("out", (100, 0), 0.0, 80.0, predecessors=("in", "in_left")),
+            straight("turn", (100, offset), 0.0, 80.0, predecessors=("in_left",)),
+        ])  # fmt: skip
+
+    report = ImportReport()
+    net = two(3.5)
+    lane_map, rows = build_lane_map(net, report=report), lane_rows(net)
+    successors = np.asarray(lane_map.successors)
+    assert successors[rows["in_left"]][successors[rows["in_left"]] >= 0].tolist() == [rows["turn"]]
+    assert rows["out"] in successors[rows["in"]] and net.lanes["in_left"].successors == ("out", "turn")
+    goal = int(np.argmax(np.asarray(lane_map.routes.is_goal)[rows["out"]]))
+    assert int(lane_map.routes.lanes_to_go[rows["in_left"], goal]) == -1
+    assert "out begins 3.5 m beside the end of in_left: traffic changes to in" in report.notes[-1].message
+    # a little aside is no leap, and where no lane beside goes on there is no other way
+    for net in (two(1.0), two(3.5, beside=False)):
+        lane_map, rows = build_lane_map(net), lane_rows(net)
+        assert rows["out"] in np.asarray(lane_map.successors)[rows["in_left"]]
 
 
 def test_a_way_in_pieces_is_followed_as_one():

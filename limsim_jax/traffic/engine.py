@@ -37,7 +37,7 @@ from limsim_jax.traffic.ego import (
     track,
     with_free,
 )
-from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, side_to_look, start
+from limsim_jax.traffic.lane_change import SLOWED, LaneChoice, choose_lane, place_beside, side_to_look, start
 from limsim_jax.traffic.motion import CREEP_SPEED, Decision, accelerations, advance, boxes, tails
 from limsim_jax.traffic.neighbors import (
     Ahead,
@@ -270,8 +270,8 @@ def _until_changed(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
     other = jnp.where(state.crossed, -state.side, state.side)  # side of the other lane
     room = room_beside(lane_map, state.lane, state.s, other)
     time = jnp.maximum(state.driver.lane_change_time * (1 - state.progress), 0.1)
-    # who is faster already, as where somebody else has driven it, does not brake for that
-    least = jnp.maximum(state.v, CREEP_SPEED)
+    # who is much faster, as where somebody else has driven it, does not brake hard for that
+    least = jnp.maximum(SLOWED * state.v, CREEP_SPEED)
     return jnp.where(state.side != 0, jnp.maximum(room / time, least), NO_GAP)
 
 

@@ -38,6 +38,9 @@ INTENT = 0.3
 SOON = 2.0
 """s ahead, at which it counts who of two vehicles is behind."""
 
+SLOWED = 0.5
+"""Of its speed, to which a vehicle may slow down so that a lane change is done before the lanes part."""
+
 BEHIND = 2.5
 """m left to the rear of a vehicle that changes to the own lane from a standstill."""
 
@@ -131,8 +134,10 @@ def place_beside(
     allowed = jnp.where(left, lane_map.may_change_left[state.lane], lane_map.may_change_right[state.lane])
     usable = ((lane_map.access[lane] >> state.shape.vehicle_class) & 1) == 1
     allowed &= usable & state.active & (state.side == 0) & ~lane_map.is_connector[state.lane]
-    # time to finish before the lanes part
-    needed = jnp.maximum(state.v, CREEP_SPEED) * state.driver.lane_change_time
+    # time to finish before the lanes part, braking gently if need be
+    time = state.driver.lane_change_time
+    mean = jnp.maximum(state.v - state.driver.b * time / 2, SLOWED * state.v)
+    needed = jnp.maximum(mean, CREEP_SPEED) * time
     allowed &= room_beside(lane_map, state.lane, state.s, side) > needed
     lane = jnp.where(allowed, lane, NO_LANE)
     return lane, side_s(lane_map, state.lane, state.s, side), allowed
