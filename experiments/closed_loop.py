@@ -210,11 +210,11 @@ def table(found: dict[str, Any]) -> str:
             "|---|---|---|" + "---:|" * len(names),
         ]
     for one in sets:
-        rows = [("all", who, one["fitted"][who.replace(" ", "_")]) for who in ("start", "closed loop")]
-        rows += [("held out", who.replace("_", " "), row) for who, row in one["held_out"].items()]
+        names_of = {"default": "default", "start": "single fits", "closed_loop": "**closed loop**"}
+        rows = [("held out", names_of[who], one["held_out"][who]) for who in names_of]
         rows += [("held out", "*own record*", one["from_own"]), ("all", "*halves*", one["floor"])]
+        rows += [("fitted, all", names_of[who], one["fitted"][who]) for who in ("start", "closed_loop")]
         for where, who, row in rows:
-            who = {"start": "single fits", "closed loop": "**closed loop**"}.get(who, who)
             values = " | ".join(f"{row[name]:.3g}" for name in names)
             lines.append(f"| {one['title']} | {where} | {who} | {values} |")
     if sets:

@@ -72,11 +72,11 @@ def test_of_two_vehicles_exactly_one_goes_first(merges):
     one = right_of_way._compare(me, mine, gap[0], foe, theirs, gap[1], prio, tie, kind)
     other = right_of_way._compare(foe, theirs, gap[1], me, mine, gap[0], -prio, -tie, kind)
     free = jnp.zeros(n, bool)
-    blocks = tuple(jnp.asarray(rng.random(n) < 0.3) for _ in range(2))
-    kept = tuple(jnp.asarray(rng.choice([0.0, 3.0, 1e3], n), jnp.float32) for _ in range(2))
-    for situation in (((free, free),), (blocks,), (blocks, kept)):
-        first = right_of_way._goes_first(one, *situation)
-        second = right_of_way._goes_first(other, *(x[::-1] for x in situation))
+    a, b = (jnp.asarray(rng.random(n) < 0.3) for _ in range(2))
+    later, sooner = (jnp.asarray(rng.choice([0.0, 3.0, 1e3], n), jnp.float32) for _ in range(2))
+    for x, y, kept in ((free, free, None), (a, b, None), (a, b, (later, sooner))):
+        first = right_of_way._goes_first(one, (x, y), kept)
+        second = right_of_way._goes_first(other, (y, x), kept and (kept[1], kept[0]))
         np.testing.assert_array_equal(np.asarray(first), ~np.asarray(second))
     one = right_of_way._goes_first(one, (free, free))
     assert 0.3 < np.asarray(one).mean() < 0.7
@@ -103,8 +103,8 @@ def meeting(me, foe, *, prio=1, **same):
     )  # fmt: skip
 
     def first(blocks=(False, False), kept=None):
-        kept = None if kept is None else tuple(jnp.float32(x) for x in kept)
-        return bool(right_of_way._goes_first(rivals, tuple(jnp.bool_(x) for x in blocks), kept))
+        kept = None if kept is None else (jnp.float32(kept[0]), jnp.float32(kept[1]))
+        return bool(right_of_way._goes_first(rivals, (jnp.bool_(blocks[0]), jnp.bool_(blocks[1])), kept))
 
     return first
 

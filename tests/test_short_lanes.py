@@ -201,12 +201,11 @@ def test_nobody_leaps_to_a_lane_that_begins_beside():
     """Two lanes go on as one: who is on the one that ends beside it changes lanes before."""
 
     def two(offset, beside=True):
-        left, right = ({"left": "in_left"}, {"right": "in"}) if beside else ({}, {})
+        left, right = ("in_left", "in") if beside else (None, None)
+        both = ("out", "turn")
         return network([
-            straight("in", (0, 0), 0.0, 100.0, successors=("out",), may_change_left=True, **left),
-            straight(
-                "in_left", (0, offset), 0.0, 100.0, successors=("out", "turn"), may_change_right=True, **right
-            ),
+            straight("in", (0, 0), 0.0, 100.0, successors=("out",), may_change_left=True, left=left),
+            straight("in_left", (0, offset), 0.0, 100.0, successors=both, may_change_right=True, right=right),
             straight("out", (100, 0), 0.0, 80.0, predecessors=("in", "in_left")),
             straight("turn", (100, offset), 0.0, 80.0, predecessors=("in_left",)),
         ])  # fmt: skip

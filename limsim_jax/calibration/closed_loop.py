@@ -743,8 +743,8 @@ def calibrate_closed_loop(
         recorded, chains = samples(part), jax.tree.map(jnp.asarray, part.chains)
         drivers = {"default": default}
         for name, law in zip(("start", "closed_loop"), laws, strict=True):
-            root = np.linalg.cholesky(law.covariance)
-            drivers[name] = drawn(*(jnp.asarray(x, jnp.float32) for x in (law.mean, root)), z)
+            mean, root = (jnp.asarray(x, jnp.float32) for x in (law.mean, np.linalg.cholesky(law.covariance)))
+            drivers[name] = drawn(mean, root, z)
         return {
             name: jax.device_get(simulate_samples(drive, p, chains, recorded, linked.dt))
             for name, p in drivers.items()
@@ -755,7 +755,7 @@ def calibrate_closed_loop(
     of = np.asarray(log.at) // math.prod(linked.counts.shape[1:])  # period of each sample
     start, law, losses = fitted(every)
     all_fitted = simulated((start, law), every)
-    held_out = jax.tree.map(np.zeros_like, all_fitted)
+    held_out = {name: (np.zeros_like(gap), np.zeros_like(v)) for name, (gap, v) in all_fitted.items()}
     for periods in folds:
         laws = fitted(sorted(set(every) - set(periods)))[:2]
         for name, both in simulated(laws, periods).items():
