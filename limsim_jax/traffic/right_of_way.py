@@ -62,6 +62,7 @@ _YELLOW = 2.5  # s of yellow that are counted on
 _OVER_LINE = 2.0  # m beyond the line at which a vehicle that rolls may still stop
 _SLOWS = 1.0  # m/s^2, braking of who may stop inside a junction
 _STANDS = 1.0  # m/s, below which the vehicle ahead counts as standing
+_STARTS = 0.2  # m/s^2, above which a vehicle that stood moves on
 _LONG = 1e3  # s, who is kept by somebody who stands comes at no time that others could tell
 
 
@@ -170,7 +171,8 @@ def give_way(lane_map: LaneMap, state: State, rows: Rows, own: Pair, lights: Lig
     full = _exit_full(lane_map, state, rows, own)
     standing = (own.lead >= 0) & (state.v[own.lead] < _STANDS) & (state.v < _STANDS)
     queued = standing & (own.lead_gap < 2 * driver.s0 + 1)
-    queued |= (state.v < _STANDS) & (state.waiting > WAITED) & ~state.held  # whatever it waits for
+    starts = state.a > _STARTS
+    queued |= (state.v < _STANDS) & (state.waiting > WAITED) & ~state.held & ~starts  # whatever it waits for
     sign, stopped = _stop_sign(lane_map, state, rows)
 
     def everywhere(x: Array) -> Array:
