@@ -98,7 +98,7 @@ def test_no_lane_change_begins_that_the_road_has_no_room_for(v):
     """The road of 2 m goes on beside, but the junction after it does not."""
     _, lane_map, _ = town()
     time, b = (float(x[0]) for x in (drivers(1).lane_change_time, drivers(1).b))
-    mean = max(v - b * time / 4, v / 2)  # it may brake gently to be done in time
+    mean = max(v - b * time / 3, v / 2)  # it may brake gently to be done in time
     needed = max(mean, 5.0) * time
     for s, expected in ((102.0 - needed - 1, True), (102.0 - needed + 1, False)):
         state = vehicles(["in"], [s], [v], ["out_left"])
@@ -116,14 +116,16 @@ def test_who_changes_lanes_is_done_before_they_part():
         crossed=jnp.asarray([False, False, True]),
     )
     found = np.asarray(_until_changed(lane_map, half))
-    assert found[0] == pytest.approx(32 / (0.5 * time), rel=1e-5) and found[1] > 1e5
-    assert found[2] == pytest.approx(72 / (0.5 * time), rel=1e-5)  # has crossed: its old lane is to the right
+    assert found[0] == pytest.approx(0.9 * 32 / (0.5 * time), rel=1e-5) and found[1] > 1e5
+    assert found[2] == pytest.approx(
+        0.9 * 72 / (0.5 * time), rel=1e-5
+    )  # has crossed: its old lane is to the right
 
 
 def test_who_has_little_room_brakes_and_has_changed_lanes_before_they_part():
     _, lane_map, _ = town()
     time, b = (float(x[0]) for x in (drivers(1).lane_change_time, drivers(1).b))
-    room = max(12.0 - b * time / 4, 6.0) * time + 2
+    room = max(12.0 - b * time / 3, 6.0) * time + 2
     state = vehicles(["in", "in"], [102.0 - room, 20.0], [12.0, 12.0], ["out_left", "out"])
 
     @jax.jit

@@ -64,6 +64,7 @@ AT_END = 40.0
 
 _BEND_POINTS = 4  # places ahead on the own lane at which the bend is looked at
 _GENTLY = 2.5  # m/s^2
+_IN_TIME = 0.9  # of the speed that would just do, as drivers come down to it by and by
 _WALL = 1.0  # m before the end of a lane that leads nowhere
 _WALL_ROOM = 25.0  # m before it, kept free to change lanes from a standstill
 
@@ -272,7 +273,7 @@ def _until_changed(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
     time = jnp.maximum(state.driver.lane_change_time * (1 - state.progress), 0.1)
     # who is much faster, as where somebody else has driven it, does not brake hard for that
     least = jnp.maximum(SLOWED * state.v, CREEP_SPEED)
-    return jnp.where(state.side != 0, jnp.maximum(room / time, least), NO_GAP)
+    return jnp.where(state.side != 0, jnp.maximum(_IN_TIME * room / time, least), NO_GAP)
 
 
 @jax.named_scope("drive")

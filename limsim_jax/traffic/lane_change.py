@@ -134,9 +134,9 @@ def place_beside(
     allowed = jnp.where(left, lane_map.may_change_left[state.lane], lane_map.may_change_right[state.lane])
     usable = ((lane_map.access[lane] >> state.shape.vehicle_class) & 1) == 1
     allowed &= usable & state.active & (state.side == 0) & ~lane_map.is_connector[state.lane]
-    # time to finish before the lanes part, braking with half of b if need be
+    # time to finish before the lanes part, braking with two thirds of b if need be
     time = state.driver.lane_change_time
-    mean = jnp.maximum(state.v - state.driver.b * time / 4, SLOWED * state.v)
+    mean = jnp.maximum(state.v - state.driver.b * time / 3, SLOWED * state.v)
     needed = jnp.maximum(mean, CREEP_SPEED) * time
     allowed &= room_beside(lane_map, state.lane, state.s, side) > needed
     lane = jnp.where(allowed, lane, NO_LANE)
