@@ -117,9 +117,8 @@ def test_who_changes_lanes_is_done_before_they_part():
     )
     found = np.asarray(_until_changed(lane_map, half))
     assert found[0] == pytest.approx(0.9 * 32 / (0.5 * time), rel=1e-5) and found[1] > 1e5
-    assert found[2] == pytest.approx(
-        0.9 * 72 / (0.5 * time), rel=1e-5
-    )  # has crossed: its old lane is to the right
+    # has crossed: its old lane is to the right
+    assert found[2] == pytest.approx(0.9 * 72 / (0.5 * time), rel=1e-5)
 
 
 def test_who_has_little_room_brakes_and_has_changed_lanes_before_they_part():
