@@ -9,16 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import curve_fit
+from synthetic import intersection
 from traffic_worlds import bundled, drivers, state_of
 
 from limsim_jax.maps.lane_map import LaneMap, build_lane_map, lane_rows
 from limsim_jax.maps.network import Control
+from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.signals import SignalState, phase_at
+from limsim_jax.rollout import Rollout, world_key
 from limsim_jax.traffic import right_of_way
+from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Traffic, drive
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.right_of_way import Rows, travel_time
 from limsim_jax.traffic.signals import DETECTOR, GAP, switch
+from limsim_jax.traffic.vehicles import default_population
 from limsim_jax.types import Config, Lights
 
 CONFIG = Config(dt=0.1)
@@ -292,3 +298,44 @@ def test_red_lights_are_obeyed_and_green_discharges_the_queue():
     headway = headway[headway < 10]
     assert 3600 / headway.mean() == pytest.approx(1700, rel=0.12)
     assert s[at == lane].max() <= length + 0.01
+
+
+def test_capacity_of_a_minor_stream_falls_with_the_major_flow_as_siegloch_has_it():
+    """A queue on a minor road that never ends, across a major one: follow-up time, critical gap, capacity.
+
+    Siegloch (1973): C = 3600 / t_f exp(-q (t_c - t_f / 2)). HCM 6th ed., ch. 20: t_c of 4 to 7 s.
+    """
+    priority = {0: Control.PRIORITY, 2: Control.PRIORITY, 1: Control.YIELD, 3: Control.YIELD}
+    net = intersection(length=200.0, control=priority)
+    goals = default_goals(net)
+    lane_map = build_lane_map(net, goals)
+    horizon, warm = 400.0, 100.0
+    flows = [Flow(origin="in0", goal="out2", rate=1200.0), Flow(origin="in1", goal="out3", rate=1700.0)]
+    demand = build_demand(
+        net, lane_map, goals, flows, default_population({"car": 1.0}), horizon=horizon
+    )  # fmt: skip
+    minor = list(goals).index("out3")
+
+    def crossed(_):
+        return lambda tick: jnp.sum(tick.left & (tick.state.goal == minor))
+
+    run = Rollout(CONFIG, Traffic(), horizon, record=crossed)
+
+    def capacity(major, seed):
+        idle = demand.idle.at[0].set(3600 / major - demand.headway[0])
+        scenario_key, key = jax.random.split(world_key(seed))
+        scenario = sample_scenario(dataclasses.replace(demand, idle=idle), lane_map, scenario_key, 64)
+        result = run(lane_map, scenario, key)
+        return result.trace.reshape(-1)[round(warm / CONFIG.dt) :].sum(), result.totals.collided
+
+    q = np.array([1.0, 300.0, 600.0, 900.0])
+    many = jax.jit(jax.vmap(jax.vmap(capacity, (None, 0)), (0, None)))
+    found, collided = (np.asarray(x) for x in many(jnp.asarray(q, jnp.float32), jnp.arange(4)))
+    found = 3600 / (horizon - warm) * found.mean(1)
+    assert not collided.any() and (np.diff(found) < 0).all()
+    follow_up = 3600 / found[0]
+    assert 1.8 < follow_up < 3.0
+    siegloch = lambda q, gap: 3600 / follow_up * np.exp(-q / 3600 * (gap - follow_up / 2))  # noqa: E731
+    (gap,), _ = curve_fit(siegloch, q, found, p0=[5.0])
+    assert 4.0 < gap < 7.0
+    np.testing.assert_allclose(found, siegloch(q, gap), rtol=0.2)

@@ -6,9 +6,10 @@ vehicles exactly one goes first, and both see it alike, because both evaluate th
 same state with the roles swapped:
 
 1. who is on the stretch goes before who is not, who can no longer stop before who can;
-2. else the one with priority (the map's, and that of the light; between equals right before left, who
-   waits longer, who comes first), unless the other has time to pass: a gap of `GAP_LEAD` seconds in front
-   of it, or it is kept back and does not come;
+2. else who has come to stand where others cross, then the one with priority (the map's, and that of the
+   light; between equals right before left, who waits longer, who comes first), unless the other has time to
+   pass: a gap of `GAP_LEAD` seconds in front of it, which is longer by the time that others keep it, if it
+   stands;
 3. who does not go first waits at the stop line, or lets the other clear the stretch, or where paths
    merge follows the other as its leader.
 
