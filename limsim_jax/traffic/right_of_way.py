@@ -310,10 +310,10 @@ def _meet(
     def both(x: Array) -> tuple[Array, Array]:
         return x[vehicle][None], x[other.slot.astype(jnp.int32)]
 
-    # who has come to stand where others cross goes before all that can still wait
+    # who has come to stand where others cross goes before all that can still wait, until it is on its way
     across = there & ~merges & ~splits & (distance_in < 0) & ~past
     blocks = jnp.zeros(n, bool).at[vehicle].max(across.any(0))
-    blocks = both(computed_once(blocks & (state.v < _STANDS) & (state.waiting > WAITED)))
+    blocks = both(computed_once(blocks & (state.waiting > WAITED)))
     # how long those who stand are kept by who goes before them in any case: so much later do they come
     kept = jnp.where(halts | (other.held > 0), _LONG, out)
     kept = jnp.where(cares & ~follows & ~_goes_first(rivals, blocks), kept, 0).max(0)
@@ -375,6 +375,7 @@ class _Passage(NamedTuple):
     ready: Array  # nothing else keeps it
     kept: Array  # it does not come
     held: Array  # it stands for the right of way
+    calm: Array  # it stands, or can still stop without haste
 
 
 def _compare(
@@ -417,14 +418,16 @@ def _compare(
             sure=(level_me > 0) | (level_foe > 0),
             forced=forced,
             major=major,
-            mine=_passage(me, mine, gap_me, foe, soon_me, merges),
-            theirs=_passage(foe, theirs, gap_foe, me, soon_foe, merges),
+            mine=_passage(me, mine, gap_me, foe, in_me, soon_me, merges),
+            theirs=_passage(foe, theirs, gap_foe, me, in_foe, soon_foe, merges),
         )
     )
 
 
-def _passage(who: _Sight, way: _Way, gap: Array, other: _Sight, soon: Array, merges: Array) -> _Passage:
-    """What it takes `who` to pass in front of `other`."""
+def _passage(
+    who: _Sight, way: _Way, gap: Array, other: _Sight, before: Array, soon: Array, merges: Array
+) -> _Passage:
+    """What it takes `who`, `before` m and `soon` s from the stretch, to pass in front of `other`."""
     start = jnp.minimum(who.v, who.slow)
     a = 0.8 * who.a
     # merging, it has to be in front by its length; crossing, to have left
@@ -435,7 +438,12 @@ def _passage(who: _Sight, way: _Way, gap: Array, other: _Sight, soon: Array, mer
     loss = jnp.where(merges, slower * slower / (4 * jnp.maximum(other.v, 1)), 0)  # other brakes with 2 m/s^2
     gap = jnp.where(who.line < 0, 0.3 * gap, gap)  # who has entered goes on
     return _Passage(
-        soon=soon, needs=out + gap + loss, ready=who.stuck == 0, kept=who.stuck > 0, held=who.held > 0
+        soon=soon,
+        needs=out + gap + loss,
+        ready=who.stuck == 0,
+        kept=who.stuck > 0,
+        held=who.held > 0,
+        calm=(who.v < _STANDS) | (before > 2 * who.brake + _MARGIN),
     )
 
 
@@ -448,7 +456,8 @@ def _goes_first(
         return minor.ready & (major.kept | (minor.needs < major.soon + jnp.where(minor.held, 0.0, later)))
 
     me, foe = (0.0, 0.0) if kept is None else kept
-    major = jnp.where(blocks[0] != blocks[1], blocks[0], rivals.major)
+    mine, theirs = blocks[0] & rivals.theirs.calm, blocks[1] & rivals.mine.calm
+    major = jnp.where(mine != theirs, mine, rivals.major)
     free = jnp.where(major, ~passes(rivals.theirs, rivals.mine, me), passes(rivals.mine, rivals.theirs, foe))
     return jnp.where(rivals.sure, rivals.forced, free)
 
