@@ -132,7 +132,8 @@ def test_who_stands_where_others_cross_goes_before_who_can_still_wait():
     inside, comes = {"line": -5.0, "held": 1.0}, {"y": -25.0, "v": 9.0}
     assert not meeting(inside, comes, prio=-1)() and meeting(inside, comes, prio=-1)(blocks=(True, False))
     assert not meeting(inside, comes, prio=-1)(blocks=(True, True))
-    # but not before who can no longer stop
+    # but not before who can no longer stop, or only in haste
+    assert not meeting(inside, comes | {"y": 4.0, "v": 4.0}, prio=-1)(blocks=(True, False))
     assert not meeting(inside, comes | {"y": 7.0}, prio=-1)(blocks=(True, False))
 
 
