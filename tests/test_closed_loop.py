@@ -135,8 +135,15 @@ def test_refuses():
         calibrate_closed_loop(linked, table(), weights={"flux": 1.0})
     with pytest.raises(ValueError, match="model 'gipps' is unknown"):
         calibrate_closed_loop(linked, table(), model="gipps")
-    with pytest.raises(ValueError, match="at least 3 are needed"):
+    with pytest.raises(ValueError, match=r"^2 drivers to fit; at least 3 are needed"):
         calibrate_closed_loop(linked, table()[:2])
+    with pytest.raises(ValueError, match=r"^1 turns\? at least 2"):
+        calibrate_closed_loop(linked, table(), turns=1)
+    # all are there in the last period alone
+    late = [replace(x, time=x.time + 8.0) for x in table()]
+    rest = [segment("a", "z", 0, np.full(120, 20.0), 10.0, 10.0)]
+    with pytest.raises(ValueError, match=r"drivers to fit without made up \d+ s; at least 3 are needed"):
+        calibrate_closed_loop(link([*rest, *late], period=8.0), [*rest, *late])
 
 
 def test_followers_outside_periods_are_cut_from_segments():
@@ -154,6 +161,12 @@ def test_followers_outside_periods_are_cut_from_segments():
         ("a", "made up", 20.7, 200), ("b", "other", 0.0, 90)
     ]  # fmt: skip
     assert left[0].gap[0] == 200.0
+    # a period without anything to compare is left out, and those after it keep their times
+    gone = link([found[0].part(0, 100), found[0].part(200, 300), found[2]], period=10.0, settle=1.0)
+    assert [name.split()[-2] for name in gone.periods] == ["0", "20", "0"]
+    assert np.allclose(gone.spans, [[0.7, 10.7], [20.7, 30.7], [0.0, 10.0]])
+    brief = link([found[0].part(0, 100), found[0].part(200, 205), found[2]], period=10.0, settle=1.0)
+    assert np.allclose(brief.spans, [[0.7, 10.7], [0.0, 10.0]]) and len(brief.periods) == 2
     assert [x.driver for x in outside(found, linked, [0])] == ["a", "b", "b"]
 
 

@@ -119,6 +119,7 @@ class Linked(NamedTuple):
             who=self.who[at],
             periods=tuple(self.periods[k] for k in periods),
             sources=tuple(self.sources[k] for k in periods),
+            spans=self.spans[at],
             counts=self.counts[at],
             slice=self.slice[at],
         )
@@ -610,8 +611,10 @@ def hold_out(linked: Linked, turns: int = TURNS) -> list[list[int]]:
     Recordings of fewer periods than turns are held out period by period, in turns over all of them.
 
     Raises:
-      ValueError: nothing is left to fit.
+      ValueError: fewer than two turns, or nothing is left to fit.
     """
+    if turns < 2:
+        raise ValueError(f"{turns} turns? at least 2, so that some periods are fitted and others held out")
     of: dict[str, list[int]] = {}
     for k, source in enumerate(linked.sources):
         of.setdefault(source, []).append(k)
@@ -672,9 +675,11 @@ def linked_recordings(
     return link(found, period=period, settle=settle)
 
 
-def single_fits(found: Sequence[Segment]) -> Law:
-    """The population of fits of the IDM to single drivers."""
-    return estimate(fit(found, "idm", starts=4), found, rounds=1)
+def single_fits(
+    found: Sequence[Segment], model: str = "idm", *, starts: int | None = 4, **options: Any
+) -> Law:
+    """The population of fits to single drivers; arguments as of `fit.fit`."""
+    return estimate(fit(found, model, starts=starts, **options), found, rounds=1)
 
 
 def calibrate_closed_loop(
@@ -713,22 +718,29 @@ def calibrate_closed_loop(
     for name in weights or {}:
         if name not in Distances._fields:
             raise ValueError(f"distance '{name}' is unknown; known are {', '.join(Distances._fields)}")
-    folds = hold_out(linked, turns)
+    folds = [tuple(held) for held in hold_out(linked, turns)]
     drive, count, every = MODELS[model], len(linked.drivers), range(len(linked.periods))
+    followers = {held: outside(found, linked, held) for held in ((), *folds)}
+    for held, some in followers.items():
+        if (left := len({segment.driver for segment in some})) < 3:
+            without = f" without {', '.join(linked.periods[k] for k in held)}" if held else ""
+            raise ValueError(f"{left} drivers to fit{without}; at least 3 are needed")
     z = scores(2 * draws, count, seed + 1)
+    z_fit = scores(draws, count, seed)
     default = default_drivers(2 * draws, count, seed + 1, speed_limit)
+    usual = _usual(speed_limit)
 
-    def fitted(periods: Sequence[int]) -> tuple[Law, Law, Floats]:
-        """Populations of these periods: of single fits, and in closed loop; the losses."""
-        start = population(outside(found, linked, sorted(set(every) - set(periods))))
-        part = linked.part(periods)
+    def fitted(held: tuple[int, ...]) -> tuple[Law, Law, Floats]:
+        """Populations of all other periods: of single fits, and in closed loop; the losses."""
+        start = population(followers[held])
+        part = linked.part([k for k in every if k not in held])
         recorded = samples(part)
         chains = jax.tree.map(jnp.asarray, part.chains)
         scale = _scale(recorded, WEIGHTS | dict(weights or {}))
         ends = []
-        for mean, root in _starts(start, speed_limit):
+        for mean, root in _starts(start, *usual):
             point, losses = _descend(
-                drive, mean, root, scores(draws, count, seed), chains, recorded, scale, linked.dt,
+                drive, mean, root, z_fit, chains, recorded, scale, linked.dt,
                 int(recorded.point.max()) + 1, iterations,
             )  # fmt: skip
             ends.append((float(jnp.min(losses)), _moved(mean, root, point), losses))
@@ -753,14 +765,13 @@ def calibrate_closed_loop(
     log = samples(linked)
     points = int(log.point.max()) + 1
     of = np.asarray(log.at) // math.prod(linked.counts.shape[1:])  # period of each sample
-    start, law, losses = fitted(every)
+    start, law, losses = fitted(())
     all_fitted = simulated((start, law), every)
     held_out = {name: (np.zeros_like(gap), np.zeros_like(v)) for name, (gap, v) in all_fitted.items()}
-    for periods in folds:
-        laws = fitted(sorted(set(every) - set(periods)))[:2]
-        for name, both in simulated(laws, periods).items():
+    for held in folds:
+        for name, both in simulated(fitted(held)[:2], held).items():
             for values, x in zip(held_out[name], both, strict=True):
-                values[:, np.isin(of, periods)] = x
+                values[:, np.isin(of, held)] = x
 
     def apart(made: Mapping[str, tuple[Floats, Floats]]) -> dict[str, Distances]:
         return {name: _on_host(distances(log, *both, points)) for name, both in made.items()}
@@ -770,7 +781,7 @@ def calibrate_closed_loop(
         start=start,
         model=model,
         sources=tuple(dict.fromkeys(linked.sources)),
-        folds=tuple(tuple(linked.periods[k] for k in periods) for periods in folds),
+        folds=tuple(tuple(linked.periods[k] for k in held) for held in folds),
         fitted=apart(all_fitted),
         held_out=apart(held_out),
         floor=floor(linked),
@@ -782,13 +793,17 @@ def calibrate_closed_loop(
     )
 
 
-def _starts(law: Law, speed_limit: float) -> list[tuple[Array, Array]]:
-    """Means and roots of the covariances of log-parameters to start from: this population, the simulator's.
+def _usual(speed_limit: float) -> tuple[Floats, Floats]:
+    """Mean and covariance of the log-parameters of the simulator's drivers."""
+    drivers = np.log(np.asarray(default_drivers(64, 64, 0, speed_limit), float)).reshape(-1, len(PARAMETERS))
+    return drivers.mean(axis=0), np.cov(drivers.T) + 1e-6 * np.eye(len(PARAMETERS))
+
+
+def _starts(law: Law, mean: Floats, covariance: Floats) -> list[tuple[Array, Array]]:
+    """Means and roots of the covariances of log-parameters to start from: the law's, the simulator's.
 
     Of desired speeds that few of the drivers tell, as in congestion, the simulator's are taken in both.
     """
-    usual = np.log(np.asarray(default_drivers(64, 64, 0, speed_limit), float)).reshape(-1, len(PARAMETERS))
-    mean, covariance = usual.mean(axis=0), np.cov(usual.T) + 1e-6 * np.eye(len(PARAMETERS))
     own_mean, own = law.mean.copy(), law.covariance.copy()
     if law.identified[0] <= IDENTIFIED:
         own_mean[0], own[0], own[:, 0] = mean[0], 0.0, 0.0

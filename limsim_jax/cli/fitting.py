@@ -49,15 +49,16 @@ def calibrate(
 ) -> None:
     """Fit car following to recorded drivers: errors, uncertainty and the population they come from."""
     import json
+    from functools import partial
 
     from limsim_jax.calibration.closed_loop import (
         SPEED_LIMIT,
         calibrate_closed_loop,
         hold_out,
         linked_recordings,
+        single_fits,
     )
-    from limsim_jax.calibration.fit import fit as single
-    from limsim_jax.calibration.population import estimate
+    from limsim_jax.calibration.recordings import read_recording
     from limsim_jax.calibration.report import calibrate as fit
     from limsim_jax.calibration.report import gather
     from limsim_jax.files import write_whole
@@ -67,21 +68,21 @@ def calibrate(
     if not 10 <= period < float("inf"):
         raise typer.BadParameter(f"{period:g} s; at least 10", param_hint="--period")
     enable_compilation_cache()
-    linked = linked_recordings(data, period=period) if closed_loop else None
+    recordings = [read_recording(path) for path in data]
+    linked = linked_recordings(recordings, period=period) if closed_loop else None
     if linked is not None:
         hold_out(linked)  # refuses what has one period only, before anything is fitted
-    found = fit(data, model=model, objective=objective, method=method, shortest=shortest, seed=seed)
+    found = fit(recordings, model=model, objective=objective, method=method, shortest=shortest, seed=seed)
     print(found.text())
     result, content = found, found.as_json()
     if linked is not None:
         if found.law is None:
             raise ValueError(f"a population from {len(found.fit.drivers)} drivers; at least 3 are needed")
-        followers, _ = gather(data, shortest=shortest)
         result = calibrate_closed_loop(
             linked,
-            followers,
-            population=lambda some: estimate(
-                single(some, model, objective=objective, method=method, seed=seed), some, rounds=1
+            gather(recordings, shortest=shortest)[0],
+            population=partial(
+                single_fits, model=model, objective=objective, method=method, starts=None, seed=seed
             ),
             model=model,
             speed_limit=speed_limit or SPEED_LIMIT,

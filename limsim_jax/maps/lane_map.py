@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from limsim_jax.geometry import derivative, direction, polynomial, wrap_angle
 from limsim_jax.maps.conflicts import ConflictTable, build_conflicts
 from limsim_jax.maps.network import ImportReport, Lane, LaneType, MapError, Network
-from limsim_jax.maps.routing import RouteTable, build_routes
+from limsim_jax.maps.routing import RouteTable, build_routes, default_goals
 from limsim_jax.maps.signals import SignalTable, build_signals
 from limsim_jax.numerics import computed_once, safe_divide, safe_sqrt
 
@@ -453,6 +453,7 @@ def build_lane_map(
         MapError: no lane for motor traffic, numbers that are not finite, a link to a lane that is not
             there, or a lane that cannot be followed within `WORST_DEVIATION`.
     """
+    goals = default_goals(network) if goals is None else goals  # those of the map as it is
     network = _without_side_steps(network, report)
     lanes = list(network.drivable_lanes())
     if not lanes:
@@ -512,25 +513,20 @@ def _without_side_steps(network: Network, report: ImportReport | None) -> Networ
     lanes = dict(network.lanes)
     for lane in network.drivable_lanes():
         beside = [lanes[name] for name in (lane.left, lane.right) if name in lanes]
+        most = lane.width[-1] / 2
         for name in lane.successors:
-            after = lanes.get(name)
-            others = [] if after is None else [x for x in beside if name in x.successors]
-            if after is None or not others or _side_step(lane, after) <= lane.width[-1] / 2:
+            going = [x for x in beside if name in x.successors and _side_step(x, lanes[name]) <= most]
+            if not going or (step := _side_step(lane, lanes[name])) <= most:
                 continue
-            if min(_side_step(x, after) for x in others) > lane.width[-1] / 2:
-                continue
-            lanes[lane.id] = replace(
-                lanes[lane.id], successors=tuple(x for x in lanes[lane.id].successors if x != name)
-            )
-            lanes[name] = replace(
-                lanes[name], predecessors=tuple(x for x in lanes[name].predecessors if x != lane.id)
-            )
+            before, after = lanes[lane.id], lanes[name]
+            lanes[lane.id] = replace(before, successors=tuple(x for x in before.successors if x != name))
+            lanes[name] = replace(after, predecessors=tuple(x for x in after.predecessors if x != lane.id))
             if report is not None:
                 report.repaired(
                     "lane link",
                     f"{lane.id} -> {name}",
-                    f"{name} begins {_side_step(lane, after):.1f} m beside the end of {lane.id}: traffic "
-                    f"changes to {others[0].id}, which goes on as it",
+                    f"{name} begins {step:.1f} m beside the end of {lane.id}: traffic changes to "
+                    f"{going[0].id}, which goes on as it",
                 )
     return network if lanes == network.lanes else replace(network, lanes=lanes)
 

@@ -372,8 +372,7 @@ class _Passage(NamedTuple):
 
     soon: Array  # s until it comes
     needs: Array  # s until it has left, and the gap that it keeps
-    ready: Array  # nothing else keeps it
-    kept: Array  # it does not come
+    stuck: Array  # it does not come
     held: Array  # it stands for the right of way
     calm: Array  # it stands, or can still stop without haste
 
@@ -440,8 +439,7 @@ def _passage(
     return _Passage(
         soon=soon,
         needs=out + gap + loss,
-        ready=who.stuck == 0,
-        kept=who.stuck > 0,
+        stuck=who.stuck > 0,
         held=who.held > 0,
         calm=(who.v < _STANDS) | (before > 2 * who.brake + _MARGIN),
     )
@@ -453,7 +451,8 @@ def _goes_first(
     """Whether `me` goes before `foe`, given whether they block others and for how many s others keep them."""
 
     def passes(minor: _Passage, major: _Passage, later: Array | float) -> Array:
-        return minor.ready & (major.kept | (minor.needs < major.soon + jnp.where(minor.held, 0.0, later)))
+        in_time = minor.needs < major.soon + jnp.where(minor.held, 0.0, later)
+        return ~minor.stuck & (major.stuck | in_time)
 
     me, foe = (0.0, 0.0) if kept is None else kept
     mine, theirs = blocks[0] & rivals.theirs.calm, blocks[1] & rivals.mine.calm
