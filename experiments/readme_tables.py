@@ -233,7 +233,30 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
     return "\n".join(rows)
 
 
+def area_of_interest(result: dict[str, Any]) -> str:
+    """Cost and fidelity by vehicles planned for and radius."""
+    titles = ("speed of the ego, m/s", "least distance, m", "driving score", "speed of all, m/s")
+    names = ("mean_speed", "min_distance", "limsim_corrected_drive", "traffic_mean_speed")
+    rows = [
+        "| planned for beside the ego | within, m | ms per world and s "
+        f"| {' | '.join(titles)} | collided | gridlock |",
+        f"|---:|---:|---:|{'---|' * len(names)}---:|---:|",
+    ]
+    for r in result["rows"]:
+        values = " | ".join(f"{r['means'][name][0]:.3g} ({r['distance'][name]:.2g})" for name in names)
+        many = "everybody" if r["radius"] is None else r["slots"]
+        within = f"{r['radius']:g}" if r["radius"] else ""
+        rows.append(
+            f"| {many} | {within} | {1e3 * r['seconds_per_world_second']:.1f} | {values} "
+            f"| {r['episodes_with_traffic_collided']} | {r['episodes_with_gridlock']} |"
+        )
+    cores = f"{result['devices']} core{'' if result['devices'] == 1 else 's'}"
+    rows += ["", f"{result['scenario']}, {result['seeds']} seeds, {result['device']}, {cores}."]
+    return "\n".join(rows)
+
+
 TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
+    "area_of_interest": area_of_interest,
     "calibration": calibration,
     "closed_loop": closed_loop,
     "maps_against_carla": carla,

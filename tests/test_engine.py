@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from synthetic import network, straight
 from traffic_worlds import bundled, drivers, scattered, shapes, state_of
 
 from limsim_jax.geometry import box_separation
-from limsim_jax.maps.lane_map import curvature, lane_rows, width
+from limsim_jax.maps.lane_map import build_lane_map, curvature, lane_rows, width
 from limsim_jax.traffic.car_following import ACC, IDM
 from limsim_jax.traffic.ego import from_lane
-from limsim_jax.traffic.engine import Traffic, drive
+from limsim_jax.traffic.engine import PATIENCE, Traffic, _give_up, drive
 from limsim_jax.traffic.lane_change import incentive, urgency
 from limsim_jax.traffic.motion import boxes, smooth_step
 from limsim_jax.types import Config, Status
@@ -285,3 +286,22 @@ def test_two_abreast_swap_lanes(lead):
     assert float(trace["apart"].min()) > 0 and float(trace["a"].min()) > -3.5
     standing = (np.asarray(trace["v"]) < 0.1) & (np.asarray(trace["lane"]) == np.asarray(lane))
     assert standing.sum(0).max() < 100  # of 600 steps of 0.1 s: no patience is tried
+
+
+def test_who_waits_before_a_wrong_lane_too_short_to_wait_on_takes_another_goal():
+    """One lane, then 4 m of two, of which the left one leads to the goal."""
+    beside = {"road": "p", "successors": ("right",), "left": "p1", "may_change_left": True}
+    map_ = network([
+        straight("a", (0.0, 0.0), 0.0, 200.0, successors=("p0",)),
+        straight("p0", (200.0, 0.0), 0.0, 4.0, **beside),
+        straight("p1", (200.0, 3.5), 0.0, 4.0, road="p", number=1, successors=("left",), right="p0"),
+        straight("right", (204.0, 0.0), 0.0, 50.0),
+        straight("left", (204.0, 3.5), 0.0, 50.0),
+    ])  # fmt: skip
+    rows, lane_map = lane_rows(map_), build_lane_map(map_, goals=[["left"], ["right"]])
+    s = [199.5, 180.0, 199.5, 1.0]
+    state = state_of("ramp", [rows["a"]] * 3 + [rows["p0"]], s, [0.0] * 4, [0] * 4)
+    waiting = jnp.asarray([PATIENCE + 1, PATIENCE + 1, PATIENCE - 1, PATIENCE + 1], jnp.float32)
+    after = _give_up(lane_map, dataclasses.replace(state, waiting=waiting))
+    np.testing.assert_array_equal(after.goal, [1, 0, 0, 1])
+    np.testing.assert_array_equal((after.status & int(Status.MISSED_ROUTE)) > 0, [True, False, False, True])

@@ -156,7 +156,7 @@ def test_yellow_is_a_dilemma_that_the_braking_decides():
 
     shown = jnp.asarray(np.stack([since, since], -1), jnp.float32)
 
-    def stops(light):
+    def stops(light, state=state):
         where, _ = right_of_way._lights(state, rows, speed, jnp.full(4, int(light)), shown)
         return np.asarray(where)[:, 0] < 1e5
 
@@ -167,6 +167,13 @@ def test_yellow_is_a_dilemma_that_the_braking_decides():
     np.testing.assert_array_equal(stops(SignalState.RED), needed <= 0.9 * 8)
     assert not stops(SignalState.GREEN_MAJOR).any() and not stops(SignalState.OFF).any()
     assert stops(SignalState.RED_YELLOW)[v < 4].any()
+    # who has begun to brake is slower than it was and looks nearer: it goes on while its own b is enough
+    b = rng.uniform(2, 8, n).astype(np.float32)
+    driver = dataclasses.replace(state.driver, b=jnp.asarray(b))
+    braking = dataclasses.replace(state, a=jnp.full(n, -1.5), driver=driver)
+    begun = stops(SignalState.YELLOW, braking) & ~stops(SignalState.YELLOW)
+    np.testing.assert_array_equal(begun, ~stops(SignalState.YELLOW) & (needed <= b))
+    assert begun.any() and not stops(SignalState.YELLOW, dataclasses.replace(braking, a=0 * b))[begun].any()
 
 
 def test_fixed_programs_follow_the_clock():

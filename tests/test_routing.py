@@ -14,6 +14,8 @@ from limsim_jax.maps import load_map
 from limsim_jax.maps.network import MapError
 from limsim_jax.maps.routing import (
     FAR,
+    NO_ROOM,
+    NO_WAY,
     ROOM_TO_CHANGE,
     SHORT_PENALTY,
     build_fixed_routes,
@@ -137,6 +139,28 @@ def test_a_detour_may_cost_less_than_changing_lanes():
     assert cheap == {"distance": 120, "next": "long0", "to_go": 1, "by": 50.0, "reachable": True}
 
 
+def test_nobody_drives_on_to_where_there_is_no_room_for_the_change_it_needs():
+    """A piece of 4 m before the fork: who is on the wrong lane waits before it, if it could change there."""
+
+    def net(changes=True, piece=4.0):
+        return network(
+            [
+                *road("a", [200, 200], {0: ["p0"], 1: ["p1"]}, changes=changes),
+                *road("p", [piece, piece], {0: ["right0"], 1: ["left0"]}),
+                *road("right", [50]),
+                *road("left", [50]),
+            ]
+        )
+
+    here = column(net(), [["left0"]])
+    assert here["a0"]["next"] is None and here["a0"]["to_go"] == 1 and here["a0"]["by"] == 200.0
+    assert here["a1"]["next"] == "p1" and here["p0"]["next"] is None and here["p0"]["reachable"]
+    # with room there the change can wait; without leave to change before, there is no other way
+    assert column(net(piece=40.0), [["left0"]])["a0"]["next"] == "p0"
+    only = column(net(changes=False), [["left0"]])
+    assert only["a0"]["next"] == "p0" and only["a0"]["to_go"] == 1 and only["a0"]["by"] == 204.0
+
+
 def test_loops_and_goals_on_the_way():
     """On a ring of four roads, the goal is reached at the end of its lane, also from that lane itself."""
     net = network([lane for i in range(4) for lane in road(f"r{i}_", [100], {0: [f"r{(i + 1) % 4}_0"]})])
@@ -206,7 +230,8 @@ def random_network(seed):
 
 def penalty(lane):
     """Of a lane change: more where the lane is short."""
-    return 17.0 + SHORT_PENALTY * max(0.0, 1 - lane.length / ROOM_TO_CHANGE)
+    hopeless = NO_WAY if lane.length < NO_ROOM else 0.0
+    return 17.0 + SHORT_PENALTY * max(0.0, 1 - lane.length / ROOM_TO_CHANGE) + hopeless
 
 
 def brute_force(net, goal):

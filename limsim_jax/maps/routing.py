@@ -33,6 +33,10 @@ ROOM_TO_CHANGE, SHORT_PENALTY = 30.0, 300.0
 """m: a lane shorter than the first is a bad place to change lanes; to changing on one of no length at all, a
 detour of the second is preferred."""
 
+NO_ROOM, NO_WAY = 10.0, 1e5
+"""m: on lanes shorter than the first nobody counts on a change; a detour of the second is preferred, and who
+must change before such a lane does not drive on to it."""
+
 TOLERANCE = 5.0
 """Metres by which lanes that lead to the same place may differ in length and still be equally good."""
 
@@ -62,7 +66,7 @@ class RouteTable:
     for every lane change; lanes side by side count with their mean length. 1e9 if unreachable."""
     next_lane: Int[Array, "L G"]
     """Best successor for a vehicle that stays in this lane to its end; -1 on goal lanes, and where the
-    goal cannot be reached without changing lanes before that."""
+    goal cannot be reached without changing lanes before that (or on a lane below `NO_ROOM` only)."""
     lanes_to_go: Int[Array, "L G"]
     """Lanes to cross (+ to the left, - to the right) the next time that the best route must change
     lanes; 0 if it never has to. Changes are put off as long as that costs nothing."""
@@ -145,7 +149,8 @@ def build_routes(
             `default_goals`.
         vehicle_class: Use only lanes that this class may use. Default: all drivable lanes.
         change_penalty: Cost of one lane change, m.
-        short_penalty: What is added on a lane of no length; on one of `ROOM_TO_CHANGE` nothing.
+        short_penalty: What is added on a lane of no length; on one of `ROOM_TO_CHANGE` nothing. 0: short
+            lanes, below `NO_ROOM` as well, are as good as others.
         tolerance: Prefer staying in the lane if it is at most this much longer, m.
 
     Raises:
@@ -368,6 +373,8 @@ class _LaneGraph:
         # where a lane is too short to change on, earlier is better
         room = self.length[np.concatenate([self.left, self.right])[:, 0]]
         changes = max(change_penalty, 1e-6) + short_penalty * np.clip(1 - room / ROOM_TO_CHANGE, 0, 1)
+        if short_penalty:
+            changes += np.where(room < NO_ROOM, NO_WAY, 0)
         costs = np.concatenate([self.cost[ahead[:, 0]], changes, self.cost[row]])
         graph = _matrix(links[:, ::-1], np.maximum(costs, 1e-6), size + count)
         cost = np.full((size, count), np.inf)
@@ -391,6 +398,7 @@ class _LaneGraph:
         next_lane[is_goal] = -1
         own = self.cost[:, None]
         straight = np.where(is_goal, own, own + behind)
+        next_lane[straight > cost + NO_WAY / 2] = -1
         # A lane is stayed in where that costs (almost) nothing; half of its length at most, so that
         # the cost to go falls along the way.
         stays = straight <= cost + np.minimum(tolerance, 0.5 * own) + 1e-6

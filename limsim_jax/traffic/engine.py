@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, bend_speed, curvature, room_beside
+from limsim_jax.maps.routing import NO_ROOM
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.numerics import computed_once, mapped_like
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
@@ -183,11 +184,16 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
     routes = lane_map.routes
     leads_on = (routes.next_lane != NO_LANE) | routes.is_goal  # [L, G], the same for all worlds
     nearest = jnp.argmin(jnp.where(leads_on, routes.distance, jnp.inf), -1).astype(state.goal.dtype)
-    to_end = lane_map.length[state.lane] - state.s
     patience = jnp.where(lane_map.speed_limit[state.lane] > FAST, PATIENCE / 4, PATIENCE)
-    stuck = state.active & ~leads_on[state.lane, state.goal] & (state.waiting > patience) & (to_end < AT_END)
-    goal = nearest[state.lane]
-    changes = stuck & leads_on.any(-1)[state.lane]
+    # who waits before a lane that is too short to wait on, or on it
+    after = routes.next_lane[state.lane, state.goal]
+    before = (after != NO_LANE) & (lane_map.length[after] < NO_ROOM)
+    lane = jnp.where(before, after, state.lane)
+    to_end = lane_map.length[state.lane] - state.s
+    near = to_end < jnp.where(before, NO_ROOM, AT_END)
+    stuck = state.active & ~leads_on[lane, state.goal] & (state.waiting > patience) & near
+    goal = nearest[lane]
+    changes = stuck & leads_on.any(-1)[lane]
     return replace(
         state,
         goal=jnp.where(changes, goal, state.goal),

@@ -482,6 +482,9 @@ def _lights(
     yellow = (light == SignalState.YELLOW) & (
         brake[:, None] <= 2 * jnp.where(late, 1.5 * YELLOW_BRAKE, YELLOW_BRAKE) * then
     )
+    # who has begun to brake, but comes down late, goes on braking
+    brakes = (state.a < -_SLOWS)[:, None] & (brake[:, None] <= 2 * state.driver.b[:, None] * line)
+    yellow |= (light == SignalState.YELLOW) & brakes
     at_red = (light == SignalState.RED) | (light == SignalState.RED_YELLOW)
     # who cannot stop any more drives on, but who only rolls stands, even with its bumper over the line
     red = at_red & (brake[:, None] <= 2 * 0.9 * state.driver.b_max[:, None] * line)

@@ -1,0 +1,118 @@
+"""What the Area of Interest costs and what is lost as it shrinks, against planning for everybody.
+
+    python experiments/area_of_interest.py [--seeds 64] [--scenario roundabout]
+
+LimSim-TM drives the ego of the scenario, and more and fewer of the vehicles around it. Cost is the time of
+the run alone, without compiling. Fidelity is how far the outcomes over seeds are from those where everybody
+is planned for (Wasserstein-1); as far are two sets of seeds from each other where everybody is. Writes
+experiments/results/area_of_interest.json and .md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from readme_tables import area_of_interest
+from scipy.stats import wasserstein_distance
+
+from limsim_jax.bench import _processor
+from limsim_jax.files import write_whole
+from limsim_jax.metrics.intervals import bootstrap
+from limsim_jax.rollout import enable_compilation_cache, use_all_cores
+from limsim_jax.sweep.episode import Episodes
+from limsim_jax.sweep.experiment import EgoTable, Experiment, read_experiments
+
+RESULTS = Path(__file__).parent / "results"
+SLOTS = 40
+"""Vehicles that there is room for in the world, all of which are planned for in the whole."""
+
+EVERYWHERE = 1e6
+"""m"""
+
+AREAS = ((0, 0.0), (2, 50.0), (4, 50.0), (8, 50.0), (16, 50.0), (16, 25.0), (16, 100.0), (SLOTS, EVERYWHERE))
+"""Vehicles planned for beside the ego, and the radius in m within which."""
+
+OUTCOMES = {
+    "mean_speed": "speed of the ego, m/s",
+    "min_distance": "least distance to others, m",
+    "limsim_corrected_drive": "driving score",
+    "traffic_mean_speed": "speed of all, m/s",
+}
+
+
+def with_area(experiment: Experiment, slots: int, radius: float) -> Experiment:
+    """The experiment with LimSim-TM at so many wheels."""
+    policy: dict[str, Any] = {"policy": "limsim_tm", "options": {}}
+    if slots:
+        options = {"around": "limsim_tm", "slots": slots, "radius": radius}
+        policy = {"policy": "area_of_interest", "options": options}
+    ego = EgoTable.model_validate(experiment.ego.model_dump() | policy)
+    return experiment.model_copy(update={"ego": ego, "slots": SLOTS})
+
+
+def outcomes(experiment: Experiment, seeds: range) -> tuple[dict[str, np.ndarray], float]:
+    """Metrics of each seed, and s of computing per world."""
+    episodes = Episodes(experiment)
+    episodes.compile()
+    chunks = [seeds[k : k + episodes.chunk] for k in range(0, len(seeds), episodes.chunk)]
+    begin = time.perf_counter()
+    found = [episodes.run(chunk).metrics for chunk in chunks]
+    spent = time.perf_counter() - begin
+    return {name: np.concatenate([some[name] for some in found]) for name in found[0]}, spent / len(seeds)
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=64)
+    parser.add_argument("--scenario", default="roundabout")
+    options = parser.parse_args()
+    use_all_cores()
+    enable_compilation_cache()
+    (experiment,) = read_experiments(options.scenario)
+    seeds, rows, whole = range(options.seeds), [], {}
+    for slots, radius in reversed(AREAS):
+        every = slots == SLOTS  # with as many seeds more: how far apart are two sets?
+        ran = range(2 * options.seeds) if every else seeds
+        found, cost = outcomes(with_area(experiment, slots, radius), ran)
+        mine = {name: values[: options.seeds] for name, values in found.items()}
+        other = mine
+        if every:
+            whole, other = mine, {name: values[options.seeds :] for name, values in found.items()}
+        rows.append({
+            "slots": slots,
+            "radius": radius if radius < EVERYWHERE else None,
+            "seconds_per_world": cost,
+            "seconds_per_world_second": cost / experiment.horizon,
+            "success": float(mine["success"].mean()),
+            "episodes_with_traffic_collided": int(np.sum(mine["traffic_collided"] > 0)),
+            "episodes_with_gridlock": int(np.sum(mine["traffic_gridlock"] > 0)),
+            "full": int(np.sum(mine["traffic_full"])),
+            "means": {name: list(bootstrap(mine[name])[:3]) for name in OUTCOMES},
+            "distance": {name: wasserstein_distance(other[name], whole[name]) for name in OUTCOMES},
+        })  # fmt: skip
+        print(json.dumps(rows[-1]), flush=True)
+    result = {
+        "scenario": experiment.name,
+        "seeds": options.seeds,
+        "horizon_s": experiment.horizon,
+        "decisions": math.ceil(experiment.horizon / (experiment.dt * experiment.decision_every)),
+        "slots": SLOTS,
+        "device": _processor() if jax.default_backend() == "cpu" else jax.devices()[0].device_kind,
+        "devices": jax.local_device_count(),
+        "rows": rows[::-1],
+    }
+    head = "Regenerate: `python experiments/area_of_interest.py`\n\n"
+    write_whole(RESULTS / "area_of_interest.json", json.dumps(result, indent=1) + "\n")
+    write_whole(RESULTS / "area_of_interest.md", f"{head}{area_of_interest(result)}\n")
+
+
+if __name__ == "__main__":
+    main()
