@@ -39,6 +39,9 @@ from limsim_jax.types import Config, State
 SCENARIOS = ("highway", "ramp", "intersection", "roundabout", "long_route")
 """Bundled experiments that are trained on."""
 
+FIRST_SEED = 1_000_000
+"""Worlds to learn from start here: sweeps start at 0 and judge what has not been seen."""
+
 
 class Samples(NamedTuple):
     """What the network learns from, `S` moments; NumPy."""
@@ -261,7 +264,7 @@ def train(
       out: file of the weights, for `PDMHybrid(weights=...)`.
       experiments: files or bundled names; their decisions are 0.5 s apart.
       policy: who drives in them.
-      seeds: worlds of each to learn from, from seed 0 on.
+      seeds: worlds of each to learn from, from `FIRST_SEED` on.
       held_out: worlds of each to measure with, the seeds after those.
       hidden: width of the layers; 512 in the paper.
       epochs: passes through the samples.
@@ -276,10 +279,11 @@ def train(
     tell = tell or (lambda line: None)
     parts: list[Samples] = []
     for name in experiments:
-        parts.append(record(name, range(seeds + held_out), policy=policy, chunk=chunk))
+        worlds = range(FIRST_SEED, FIRST_SEED + seeds + held_out)
+        parts.append(record(name, worlds, policy=policy, chunk=chunk))
         tell(f"{name}: {len(parts[-1].future)} moments")
     samples = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    learns = samples.seed < seeds
+    learns = samples.seed < FIRST_SEED + seeds
     if not learns.any() or learns.all():
         raise ValueError("too few moments: in some seeds an ego has to drive for more than eight seconds")
     seen, unseen = (jax.tree.map(lambda x, which=which: x[which], samples) for which in (learns, ~learns))

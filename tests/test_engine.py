@@ -15,7 +15,7 @@ from limsim_jax.maps.lane_map import build_lane_map, curvature, lane_rows, width
 from limsim_jax.traffic.car_following import ACC, IDM
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.engine import PATIENCE, Traffic, _give_up, drive
-from limsim_jax.traffic.lane_change import incentive, urgency
+from limsim_jax.traffic.lane_change import closing, incentive, urgency
 from limsim_jax.traffic.motion import boxes, smooth_step
 from limsim_jax.types import Config, Status
 
@@ -229,6 +229,21 @@ def test_mobil_incentive():
     # egoist: own gain alone; altruist: + (-0.3 - 0.5) + (0.4 + 0.1)
     np.testing.assert_allclose(incentive(**arrays, politeness=jnp.float32(0.0)), 0.8, rtol=1e-6)
     np.testing.assert_allclose(incentive(**arrays, politeness=jnp.float32(1.0)), 0.5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("a_lead", [0.0, -2.7, 1.5])
+def test_braking_for_a_leader_that_brakes_on(a_lead):
+    """Followed step by step, both are as fast when the gap is used up; who speeds up counts as steady."""
+    v, v_lead, gap = (np.asarray(x) for x in ([25.0, 18.0, 9.0], [17.0, 16.0, 12.0], [20.0, 6.0, 5.0]))
+    seen = (v, v_lead, np.full(3, a_lead), gap)
+    need = np.asarray(closing(*(jnp.asarray(x, jnp.float32) for x in seen)), float)
+    for k in range(2):
+        dt, left, mine, lead = 1e-4, gap[k], v[k], v_lead[k]
+        while mine > lead:
+            left += dt * (lead - mine)
+            mine, lead = mine - dt * need[k], lead + dt * min(a_lead, 0)
+        assert left == pytest.approx(0, abs=0.01)
+    assert need[2] == 0  # slower than the leader
 
 
 def test_urgency_grows_towards_the_last_place_and_with_the_lanes_to_cross():

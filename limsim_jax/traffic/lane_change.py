@@ -97,10 +97,13 @@ def incentive(
     return own_then - own_now + politeness * (new_then - new_now + old_then - old_now)
 
 
-def closing(v: Float[Array, " N"], v_lead: Float[Array, " N"], gap: Float[Array, " N"]) -> Float[Array, " N"]:
-    """Braking, m/s^2, that brings `v` down to the leader's speed within the gap."""
+def closing(
+    v: Float[Array, " N"], v_lead: Float[Array, " N"], a_lead: Float[Array, " N"], gap: Float[Array, " N"]
+) -> Float[Array, " N"]:
+    """Braking, m/s^2, that brings `v` down to the leader's speed within the gap, if that brakes on as now."""
     faster = jnp.maximum(v - v_lead, 0)
-    return faster * faster / (2 * jnp.maximum(gap, ROOM))
+    slows = jnp.where(faster > 0, jnp.maximum(-a_lead, 0), 0)
+    return faster * faster / (2 * jnp.maximum(gap, ROOM)) + slows
 
 
 def side_to_look(lane_map: LaneMap, state: State, turn: Int[Array, ""]) -> Int[Array, " N"]:
@@ -216,7 +219,7 @@ def choose_lane(
     b_safe = driver.b_safe + SAFE_URGENT * press
     # the models are mild where a cut-in leaves a short gap; what the speeds ask for must not be hard either
     b_lag, b_own = (HARDEST * jnp.where(i[k] < 0, 0, driver.b_max[i[k]]) for k in (3, 1))
-    need_lag, need_own = (closing(v[k], v_lead[k], gap[k]) for k in (3, 1))
+    need_lag, need_own = (closing(v[k], v_lead[k], a_lead[k], gap[k]) for k in (3, 1))
     safe = (~follower | ((new_then > -b_safe) & (need_lag < b_lag) & (pair.lag_gap > ROOM))) & (
         (pair.lead < 0) | ((own_then > -b_safe) & (need_own < b_own) & (pair.lead_gap > ROOM))
     )
