@@ -413,9 +413,13 @@ def test_how_fast_the_others_around_the_ego_are():
 
 
 def parts(state, k):
-    """The two lanes that a vehicle may be on, and its front bumper along each."""
+    """The two lanes that a vehicle may be on, and its front bumper along each.
+
+    The lanes behind those are long, or no connectors; for others see test_short_lanes.
+    """
     before = state.previous[k]
-    tail = [(before, state.s[k] + host().length[before])] if before != NO_LANE else []
+    there = before != NO_LANE and state.s[k] < state.shape.length[k]
+    tail = [(before, state.s[k] + host().length[before])] if there else []
     return [*([(state.lane[k], state.s[k])] if state.lane[k] != NO_LANE else []), *tail]
 
 

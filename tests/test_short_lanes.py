@@ -14,6 +14,7 @@ from traffic_worlds import bundled, drivers, shapes
 from limsim_jax.geometry import box_separation
 from limsim_jax.maps.lane_map import build_lane_map, lane_rows
 from limsim_jax.maps.network import ImportReport
+from limsim_jax.metrics.observer import _zones
 from limsim_jax.traffic.demand import start_state
 from limsim_jax.traffic.engine import Command, Traffic, _until_changed, drive
 from limsim_jax.traffic.lane_change import place_beside
@@ -163,8 +164,8 @@ def test_tails_are_on_lanes_behind_as_far_as_the_vehicle_is_long():
     assert front[2, 0] == pytest.approx(3.0 + at[rows["first"]])
 
 
-def test_who_waits_behind_a_short_road_is_seen_by_those_whose_way_its_tail_is_on():
-    """One stands on the road of 2 m after a crossing with its tail on the crossing, two lanes back."""
+def blocked_crossing():
+    """One has stopped on half a metre of road after a crossing, with its tail on that; one comes to it."""
     lanes = [
         straight("west", (-60, 0), 0.0, 60.0, successors=("cross",)),
         straight("cross", (0, 0), 0.0, 8.0, junction="J", successors=("bit",)),
@@ -184,6 +185,19 @@ def test_who_waits_behind_a_short_road_is_seen_by_those_whose_way_its_tail_is_on
         goal=jnp.asarray([int(np.argmax(is_goal[rows[x]])) for x in ("east", "north")]), active=None,
     )  # fmt: skip
     state = dataclasses.replace(state, previous=jnp.asarray([rows["bit"], -1], jnp.int32))
+    return lane_map, rows, state
+
+
+def test_who_is_in_a_conflict_zone_with_its_tail_two_lanes_back():
+    lane_map, rows, state = blocked_crossing()
+    zones = _zones(lane_map, state, jnp.int32(1), jnp.int32(rows["up"]))
+    assert int((zones.id >= 0).sum()) == 1 and bool(zones.other.any()) and not bool(zones.ego.any())
+    gone = dataclasses.replace(state, s=state.s.at[0].set(4.5))
+    assert not bool(_zones(lane_map, gone, jnp.int32(1), jnp.int32(rows["up"])).other.any())
+
+
+def test_who_waits_behind_a_short_road_is_seen_by_those_whose_way_its_tail_is_on():
+    lane_map, _, state = blocked_crossing()
     brake = jnp.asarray([True, False])
 
     @jax.jit

@@ -21,7 +21,7 @@ from limsim_jax.metrics.traffic import Detectors, TrafficCarry, TrafficMetrics, 
 from limsim_jax.traffic.collision import CLEARANCE, level, off_road
 from limsim_jax.traffic.ego import arrived, body_place
 from limsim_jax.traffic.engine import Tick
-from limsim_jax.traffic.motion import boxes
+from limsim_jax.traffic.motion import boxes, tails
 from limsim_jax.traffic.neighbors import other_lane
 from limsim_jax.types import Config, State, Status
 
@@ -263,12 +263,12 @@ def _zones(lane_map: LaneMap, state: State, slot: Int[Array, ""], following: Int
 
     mine = inside(front[:, None], state.shape.length[slot], table.s_in[row], table.s_out[row])
     others = state.active & (jnp.arange(state.lane.shape[0]) != slot)
-    tail = state.s + lane_map.length[state.previous]
+    behind, along = tails(lane_map, state)
     lane, begin, end = (
         x[..., None] for x in (table.lane[foe], table.f_in[row], table.f_out[row])
     )  # [3, C, 1]
     theirs = jnp.zeros((), bool)
-    for at, front in ((state.lane, state.s), (state.previous, tail)):
+    for at, front in ((state.lane, state.s), *zip(behind.T, along.T, strict=True)):
         at, front, length = (x[None, None] for x in (at, front, state.shape.length))
         theirs |= (lane == at) & inside(front, length, begin, end)
     theirs = (theirs & others[None, None]).any(-1)
