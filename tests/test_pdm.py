@@ -237,7 +237,7 @@ def test_a_free_road_is_scored_by_progress_alone():
 def test_edges_of_the_road():
     # the first vehicle is 2 m wide: 0.75 m aside it touches the right edge, 4.25 m the left lane's
     y = np.zeros(P)
-    y[:8] = [0, -0.7, -0.9, -1.1, 4.2, 7.7, 7.9, 8.2]
+    y[:8] = [0, -0.7, -0.83, -0.9, 4.2, 7.7, 7.83, 7.9]
     found = scored(paths(10.0, y), *FAR_AWAY)
     np.testing.assert_array_equal(found["drivable"][0, :8], [1, 1, 1, 0, 1, 1, 1, 0])
     exact = scored(paths(10.0, y), *FAR_AWAY, strict=True)

@@ -22,7 +22,8 @@ required lane change   a path in the lane beside replaces    none: stands at the
                        one of the three, minds those behind,
                        too, and signals
 lights                 red, and yellow that one can obey     red
-edge of the road       0.3 m as in nuPlan's own metric       to the centimetre
+edge of the road       0.1 m of the 0.3 m that nuPlan's      to the centimetre
+                       own metric allows
 profiles to track      those of the IDM and of the path      least squares over the poses
 bicycle                moves along its mean heading          moves along its heading before (Euler)
 scores                 equal within 0.001                    exact
@@ -96,6 +97,7 @@ implementation; m/s^2 of braking in ours."""
 
 _POINTS, _STEP = 121, 2.0  # of the way: 240 m
 _KEEPS = 61  # points of the way on which all of the body keeps to the road: 120 m
+_OVERSHOOT = 0.2  # m of that which a proposal leaves, as the next one may come out farther
 _EDGE = 0.3  # m from there to the edge, for what the tracker does not manage
 _LANES = 6  # of the way, beyond the first
 _LOOK = 10  # steps that the tracker looks ahead
@@ -689,7 +691,7 @@ def _places(road: Road, body: Body, proposals: Proposals, motion: Motion, strict
         table, k.reshape(k.shape[0], -1), -1
     ).reshape(k.shape)
     left, right, half = at(road.way.left), at(road.way.right), at(road.half)
-    slack = 0.0 if strict else OVERHANG
+    slack = 0.0 if strict else OVERHANG - _OVERSHOOT
     off = (most > left + at(road.oncoming) + slack) | (least < -right - slack)
     lane_of = lambda value: (value > half).astype(jnp.int32) - (value < -half).astype(jnp.int32)  # noqa: E731
     return _Places(
