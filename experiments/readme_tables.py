@@ -118,7 +118,8 @@ def traffic_sumo(result: dict[str, Any]) -> str:
     one = result["one_lane"]["ballistic, as ours"]
 
     def mean(runs: list[dict[str, Any]], name: str) -> float:
-        return sum(run[name] for run in runs) / len(runs)
+        values = [run[name] for run in runs if run[name] is not None]  # nobody may arrive in a jam
+        return sum(values) / max(len(values), 1)
 
     rows = [
         "| network, SUMO (IDM) / ours (ACC-IDM) | arrived, veh/h | mean speed, m/s | travel time, s "

@@ -599,8 +599,8 @@ class _Observer:
         return {
             "arrived_per_hour": 3600 * len(self.trips) / (seconds - WARM_UP),
             "mean_speed": self.distance / self.time,
-            "travel_time": statistics.fmean(self.trips),
-            "depart_delay": statistics.fmean(self.delays),
+            "travel_time": statistics.fmean(self.trips) if self.trips else None,
+            "depart_delay": statistics.fmean(self.delays) if self.delays else None,
             "running": self.time / (self.steps * DT),
             "lane_changes_per_km": 1000 * self.changes / self.distance,
             "hard_brakings_per_km": 1000 * self.hard / self.distance,
@@ -738,7 +738,11 @@ pasubio_tls.add.xml and every fourth vehicle.
 """
 
 
-def _spread(values: Sequence[float], digits: int) -> str:
+def _spread(of_runs: Sequence[float | None], digits: int) -> str:
+    """Mean and standard deviation; runs in which nobody arrived have no travel time."""
+    values = [x for x in of_runs if x is not None]
+    if not values:
+        return "none arrived"
     mean = f"{statistics.fmean(values):.{digits}f}"
     return mean if len(values) < 2 else f"{mean} ± {statistics.stdev(values):.{digits}f}"
 
