@@ -1,6 +1,6 @@
 """What the Area of Interest costs and what is lost as it shrinks, against planning for everybody.
 
-    python experiments/area_of_interest.py [--seeds 64] [--scenario roundabout]
+    python experiments/area_of_interest.py [--seeds 32] [--scenario roundabout]
 
 LimSim-TM drives the ego of the scenario, and more and fewer of the vehicles around it. Cost is the time of
 the run alone, without compiling. Fidelity is how far the outcomes over seeds are from those where everybody
@@ -30,13 +30,13 @@ from limsim_jax.sweep.episode import Episodes
 from limsim_jax.sweep.experiment import EgoTable, Experiment, read_experiments
 
 RESULTS = Path(__file__).parent / "results"
-SLOTS = 40
+SLOTS = 32
 """Vehicles that there is room for in the world, all of which are planned for in the whole."""
 
 EVERYWHERE = 1e6
 """m"""
 
-AREAS = ((0, 0.0), (2, 50.0), (4, 50.0), (8, 50.0), (16, 50.0), (16, 25.0), (16, 100.0), (SLOTS, EVERYWHERE))
+AREAS = ((0, 0.0), (2, 50.0), (4, 50.0), (8, 50.0), (16, 25.0), (16, 50.0), (SLOTS, EVERYWHERE))
 """Vehicles planned for beside the ego, and the radius in m within which."""
 
 OUTCOMES = {
@@ -57,9 +57,9 @@ def with_area(experiment: Experiment, slots: int, radius: float) -> Experiment:
     return experiment.model_copy(update={"ego": ego, "slots": SLOTS})
 
 
-def outcomes(experiment: Experiment, seeds: range) -> tuple[dict[str, np.ndarray], float]:
+def outcomes(experiment: Experiment, seeds: range, chunk: int) -> tuple[dict[str, np.ndarray], float]:
     """Metrics of each seed, and s of computing per world."""
-    episodes = Episodes(experiment)
+    episodes = Episodes(experiment, chunk=chunk)
     episodes.compile()
     chunks = [seeds[k : k + episodes.chunk] for k in range(0, len(seeds), episodes.chunk)]
     begin = time.perf_counter()
@@ -71,7 +71,7 @@ def outcomes(experiment: Experiment, seeds: range) -> tuple[dict[str, np.ndarray
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=64)
+    parser.add_argument("--seeds", type=int, default=32)
     parser.add_argument("--scenario", default="roundabout")
     options = parser.parse_args()
     use_all_cores()
@@ -81,7 +81,7 @@ def main() -> None:
     for slots, radius in reversed(AREAS):
         every = slots == SLOTS  # with as many seeds more: how far apart are two sets?
         ran = range(2 * options.seeds) if every else seeds
-        found, cost = outcomes(with_area(experiment, slots, radius), ran)
+        found, cost = outcomes(with_area(experiment, slots, radius), ran, options.seeds)
         mine = {name: values[: options.seeds] for name, values in found.items()}
         other = mine
         if every:

@@ -722,18 +722,22 @@ pasubio_tls.add.xml and every fourth vehicle.
   what the driver accepts (2.5 m/s^2, on average). Turning queues discharge slower, and so do lanes that
   are led sideways within a few metres of a junction (104012170 of ingolstadt1).
 - Lane changes take no time and no way in SUMO. Ours take 3 to 7 s and 22 m at least, so that edges shorter
-  than that hardly serve; who ends up there on the wrong lane takes another way (edge 164051413 of
-  ingolstadt1, 8.9 m; edge -28 of limsim_town05, 27 m). Turns are then missed that SUMO's drivers make.
+  than that hardly serve: on those below 10 m nobody counts on a change, and whoever is on the wrong lane
+  there, or on one a little longer, takes another way (edge 164051413 of ingolstadt1, 8.9 m; edge -28 of
+  limsim_town05, 27 m). Turns are then missed that SUMO's drivers make.
+- Gaps: ours enter a crossing with a critical gap of about 6 s, as Siegloch's formula has it for turns from
+  minor roads; SUMO's go when they are clear a second before the other comes. Minor arms discharge slower
+  (391891458 of ingolstadt1: the queue behind it is what waits outside).
 - SUMO's drivers choose the lane that leads on farthest, and so use all lanes of the roundabout. Ours stay on
   the lane of their exit, four fifths of them on the outermost, and wait for one another.
-- limsim_bigInter jams in ours when vehicles that have entered on a gap meet others inside: priority is not
-  transitive there (E0 yields to -E1, which yields to E2, whose path E0 blocks).
-- Red lights are crossed by the ACC-IDM only, above all in bologna_pasubio: with b = 4.5 m/s^2 it begins to
-  brake late, and may then be unable to stop. The IDM crosses none.
+- limsim_bigInter jams in some runs of ours when vehicles that have entered on a gap meet others inside:
+  seven of them then stand with their noses in each other's ways. SUMO's drivers do so as well, and are
+  teleported.
 - limsim_town05 and bologna_pasubio count as gridlocked as soon as one vehicle stands for 120 s, which happens
-  behind long red phases and missed turns; traffic as a whole goes on but in one run of town05.
+  behind long red phases and missed turns; traffic as a whole goes on.
 - SUMO looks for collisions along lanes. Ours compares bodies, so it also finds those who touch beside
-  one another where lanes come close.
+  one another where lanes come close: side by side on the two lanes of 1200363973 in ingolstadt1, which are
+  led 3 m sideways within 8 m, and of 5_2 in bologna_pasubio, whose shapes come within 1.7 m.
 - Vehicles that stand for 300 s are teleported by SUMO. Ours stay, and hold up all behind them.
 """
 
