@@ -733,8 +733,8 @@ pasubio_tls.add.xml and every fourth vehicle.
 - limsim_bigInter jams in some runs of ours when vehicles that have entered on a gap meet others inside:
   seven of them then stand with their noses in each other's ways. SUMO's drivers do so as well, and are
   teleported.
-- limsim_town05 and bologna_pasubio count as gridlocked as soon as one vehicle stands for 120 s, which happens
-  behind long red phases and missed turns; traffic as a whole goes on.
+- ingolstadt1 and limsim_town05 count as gridlocked as soon as one vehicle stands for 120 s, which happens
+  in minor arms, behind long red phases and missed turns; traffic as a whole goes on.
 - SUMO looks for collisions along lanes. Ours compares bodies, so it also finds those who touch beside
   one another where lanes come close: side by side on the two lanes of 1200363973 in ingolstadt1, which are
   led 3 m sideways within 8 m, and of 5_2 in bologna_pasubio, whose shapes come within 1.7 m.
