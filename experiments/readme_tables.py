@@ -239,7 +239,7 @@ def area_of_interest(result: dict[str, Any]) -> str:
     titles = ("speed of the ego, m/s", "least distance, m", "driving score", "speed of all, m/s")
     names = ("mean_speed", "min_distance", "limsim_corrected_drive", "traffic_mean_speed")
     rows = [
-        "| planned for beside the ego | within, m | ms per world and s "
+        "| planned for beside the ego | within, m | CPU ms per world and s "
         f"| {' | '.join(titles)} | collided | gridlock |",
         f"|---:|---:|---:|{'---|' * len(names)}---:|---:|",
     ]
