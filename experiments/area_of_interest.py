@@ -30,13 +30,13 @@ from limsim_jax.sweep.episode import Episodes
 from limsim_jax.sweep.experiment import EgoTable, Experiment, read_experiments
 
 RESULTS = Path(__file__).parent / "results"
-SLOTS = 24
+SLOTS = 40
 """Vehicles that there is room for in the world, all of which are planned for in the whole."""
 
 EVERYWHERE = 1e6
 """m"""
 
-AREAS = ((0, 0.0), (4, 25.0), (8, 25.0), (8, 50.0), (16, 50.0), (SLOTS, EVERYWHERE))
+AREAS = ((8, 50.0), (16, 50.0), (SLOTS, EVERYWHERE))
 """Vehicles planned for beside the ego, and the radius in m within which."""
 
 OUTCOMES = {

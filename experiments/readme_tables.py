@@ -257,6 +257,7 @@ def area_of_interest(result: dict[str, Any]) -> str:
 
 
 TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
+    "area_of_interest": area_of_interest,
     "calibration": calibration,
     "closed_loop": closed_loop,
     "maps_against_carla": carla,
