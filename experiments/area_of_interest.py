@@ -2,7 +2,7 @@
 
     python experiments/area_of_interest.py [--seeds 24] [--scenario roundabout]
 
-LimSim-TM drives the ego of the scenario, and more and fewer of the vehicles around it. Cost is the CPU time
+LimSim-TM drives the ego of the scenario, and more or fewer of the vehicles around it. Cost is the CPU time
 of the run alone, without compiling. Fidelity is how far the outcomes over seeds are from those where
 everybody is planned for (Wasserstein-1); as far are two sets of seeds from each other where everybody is.
 Writes experiments/results/area_of_interest.json and .md.
@@ -12,14 +12,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import time
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
-from readme_tables import area_of_interest
+from readme_tables import OUTCOMES, area_of_interest
 from scipy.stats import wasserstein_distance
 
 from limsim_jax.bench import _processor
@@ -27,7 +25,7 @@ from limsim_jax.files import write_whole
 from limsim_jax.metrics.intervals import bootstrap
 from limsim_jax.rollout import enable_compilation_cache, use_all_cores
 from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import EgoTable, Experiment, read_experiments
+from limsim_jax.sweep.experiment import Experiment, read_experiments
 
 RESULTS = Path(__file__).parent / "results"
 SLOTS = 40
@@ -39,21 +37,11 @@ EVERYWHERE = 1e6
 AREAS = ((8, 50.0), (16, 50.0), (SLOTS, EVERYWHERE))
 """Vehicles planned for beside the ego, and the radius in m within which."""
 
-OUTCOMES = {
-    "mean_speed": "speed of the ego, m/s",
-    "min_distance": "least distance to others, m",
-    "limsim_corrected_drive": "driving score",
-    "traffic_mean_speed": "speed of all, m/s",
-}
-
 
 def with_area(experiment: Experiment, slots: int, radius: float) -> Experiment:
-    """The experiment with LimSim-TM at so many wheels."""
-    policy: dict[str, Any] = {"policy": "limsim_tm", "options": {}}
-    if slots:
-        options = {"around": "limsim_tm", "slots": slots, "radius": radius}
-        policy = {"policy": "area_of_interest", "options": options}
-    ego = EgoTable.model_validate(experiment.ego.model_dump() | policy)
+    """The experiment with LimSim-TM at so many wheels beside the ego's."""
+    options = {"around": "limsim_tm", "slots": slots, "radius": radius}
+    ego = experiment.ego.model_copy(update={"options": options})
     return experiment.model_copy(update={"ego": ego, "slots": SLOTS})
 
 
@@ -76,7 +64,7 @@ def main() -> None:
     options = parser.parse_args()
     use_all_cores()
     enable_compilation_cache()
-    (experiment,) = read_experiments(options.scenario)
+    (experiment,) = read_experiments(options.scenario, policy="area_of_interest")
     seeds, rows, whole = range(options.seeds), [], {}
     for slots, radius in reversed(AREAS):
         every = slots == SLOTS  # with as many seeds more: how far apart are two sets?
@@ -103,7 +91,6 @@ def main() -> None:
         "scenario": experiment.name,
         "seeds": options.seeds,
         "horizon_s": experiment.horizon,
-        "decisions": math.ceil(experiment.horizon / (experiment.dt * experiment.decision_every)),
         "slots": SLOTS,
         "device": _processor() if jax.default_backend() == "cpu" else jax.devices()[0].device_kind,
         "devices": jax.local_device_count(),

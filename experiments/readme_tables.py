@@ -234,17 +234,24 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
     return "\n".join(rows)
 
 
+OUTCOMES = {
+    "mean_speed": "speed of the ego, m/s",
+    "min_distance": "least distance, m",
+    "limsim_corrected_drive": "driving score",
+    "traffic_mean_speed": "speed of all, m/s",
+}
+"""Metrics by which areas of interest are compared."""
+
+
 def area_of_interest(result: dict[str, Any]) -> str:
     """Cost and fidelity by vehicles planned for and radius."""
-    titles = ("speed of the ego, m/s", "least distance, m", "driving score", "speed of all, m/s")
-    names = ("mean_speed", "min_distance", "limsim_corrected_drive", "traffic_mean_speed")
     rows = [
         "| planned for beside the ego | within, m | CPU ms per world and s "
-        f"| {' | '.join(titles)} | collided | gridlock |",
-        f"|---:|---:|---:|{'---|' * len(names)}---:|---:|",
+        f"| {' | '.join(OUTCOMES.values())} | collided | gridlock |",
+        f"|---:|---:|---:|{'---|' * len(OUTCOMES)}---:|---:|",
     ]
     for r in result["rows"]:
-        values = " | ".join(f"{r['means'][name][0]:.3g} ({r['distance'][name]:.2g})" for name in names)
+        values = " | ".join(f"{r['means'][name][0]:.3g} ({r['distance'][name]:.2g})" for name in OUTCOMES)
         many = "everybody" if r["radius"] is None else r["slots"]
         within = f"{r['radius']:g}" if r["radius"] else ""
         rows.append(

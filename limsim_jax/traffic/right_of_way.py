@@ -479,21 +479,20 @@ def _lights(
     then = line + state.v[:, None] * since
     # who slows down for a turn comes too late even if it is near
     late = 2 * then > _YELLOW * (state.v[:, None] + speed)
-    yellow = (light == SignalState.YELLOW) & (
-        brake[:, None] <= 2 * jnp.where(late, 1.5 * YELLOW_BRAKE, YELLOW_BRAKE) * then
-    )
+    could = brake[:, None] <= 2 * jnp.where(late, 1.5 * YELLOW_BRAKE, YELLOW_BRAKE) * then
     # who has begun to brake, but comes down late, goes on braking
     brakes = (state.a < -_SLOWS)[:, None] & (brake[:, None] <= 2 * state.driver.b[:, None] * line)
-    yellow |= (light == SignalState.YELLOW) & brakes
+    at_yellow = light == SignalState.YELLOW
+    yellow = at_yellow & (could | brakes)
     at_red = (light == SignalState.RED) | (light == SignalState.RED_YELLOW)
     # who cannot stop any more drives on, but who only rolls stands, even with its bumper over the line
     red = at_red & (brake[:, None] <= 2 * 0.9 * state.driver.b_max[:, None] * line)
     rolls = (state.v < _STANDS)[:, None] & (rows.line > -_OVER_LINE)
-    red |= (at_red | (light == SignalState.YELLOW)) & rolls
+    red |= (at_red | at_yellow) & rolls
     stops = (yellow | red) & (rows.x < 0) & (rows.line > -NO_GAP / 2) & (rows.connector >= 0)
     minor = (light == SignalState.GREEN_MINOR) | (light == SignalState.STOP)
     major = jnp.where(light == SignalState.GREEN_MAJOR, 1, jnp.where(minor, -1, 0))
-    left_over = (rows.line < -_MARGIN) & (at_red | (light == SignalState.YELLOW))  # clears the junction first
+    left_over = (rows.line < -_MARGIN) & (at_red | at_yellow)  # clears the junction first
     stop = jnp.where(stops, jnp.maximum(rows.line - _MARGIN, -_MARGIN), NO_GAP)
     return stop, jnp.where(left_over, 2, major)
 
