@@ -1,6 +1,6 @@
 """How fast traffic runs on this machine, next to SUMO on the same maps with the same flows.
 
-    python experiments/traffic_speed.py [--worlds 256] [--seconds 20]
+    python experiments/traffic_speed.py [--worlds 256] [--seconds 60]
 
 Writes experiments/results/traffic_speed.json and .md. `limsim-jax bench traffic MAP` measures one map.
 """
@@ -45,7 +45,7 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=256)
-    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--seconds", type=float, default=60.0)
     options = parser.parse_args()
     rows = []
     for k, (name, slots) in enumerate(CASES):

@@ -274,11 +274,11 @@ def _meet(
     level = me.y - s_in + f_in  # on the foe; splits begin together, or one way goes on over several lanes
     wanted = shelf.key(foe, share(foe, jnp.where(splits, level, f_out)[0]))
     q = jnp.arange(_FOES)[:, None]
-    place = shelf.first_from(order, wanted)[None] + jnp.where(splits, q - 1, -1 - q)
+    place = computed_once(shelf.first_from(order, wanted))[None] + jnp.where(splits, q - 1, -1 - q)
     index = computed_once(entry[jnp.clip(place, 0, count - 1)])  # [Q, P]
     there = (place >= 0) & (place < count) & (connector[index] == foe[None]) & exists[None]
     other = computed_once(_Sight(*(x[index] for x in entries)))
-    there &= other.slot != me.slot
+    there = computed_once(there & (other.slot != me.slot))
 
     mine, theirs = _Way(s_in, s_out), _Way(f_in, f_out)
     gaps = _gap(driver, state)
