@@ -144,13 +144,24 @@ def test_stretches_agree_with_brute_force(net):
                 np.testing.assert_allclose(hull, expected, atol=0.05)
 
 
-def test_lanes_side_by_side_do_not_conflict():
-    """Even if they are narrower than the reach, lanes of one road are apart; only roads can meet."""
-    a = straight("a", (0, 0), 0.0, 30.0, road="r", junction="J")
-    b = straight("b", (0, 2.0), 0.0, 30.0, road="r", junction="J")
-    assert not entries(network([a, b]))
-    b = straight("b", (0, 2.0), 0.0, 30.0, road="other", junction="J")
-    assert entries(network([a, b]))
+@pytest.mark.parametrize("apart", [1.7, 2.4])
+def test_lanes_of_one_road_that_come_too_close_merge(apart):
+    """Lanes side by side have room for two; where a file draws them closer, one vehicle follows the other."""
+    # 3.5 m apart at both ends, where they lead on as lanes of their own
+    x = np.linspace(0, 60, 601)
+    y = 3.5 - (3.5 - apart) * np.sin(math.pi * x / 60) ** 2
+    a = straight("a", (0, 0), 0.0, 60.0, road="r", junction="J")
+    b = lane_along(np.column_stack([x, y]), "b", road="r", junction="J")
+    found = entries(network([a, b]))
+    if apart > REACH:
+        assert not found
+        return
+    (entry,) = found["a", "b"]
+    assert (entry["type"], entry["prio"]) == (ConflictType.MERGE, 0)
+    half = 60 / math.pi * math.acos(math.sqrt((3.5 - REACH) / (3.5 - apart)))
+    np.testing.assert_allclose([entry["s_in"], entry["s_out"]], [30 - half, 30 + half], atol=0.15)  # b slants
+    b = dataclasses.replace(b, road="other")
+    assert entries(network([a, b]))["a", "b"][0]["type"] == ConflictType.CROSS
 
 
 def test_a_lane_does_not_conflict_with_what_follows_it():
@@ -557,7 +568,8 @@ def test_conflicts_are_the_foes_of_sumo(path):
 
     SUMO also calls foes any two movements into one edge, on whichever lanes; those never come close.
     On the other side, of the turns that SUMO lets pass each other a few graze: opposing turns into
-    different roads, which overlap for less than 3 m.
+    different roads, which overlap for less than 3 m. Lanes of one road that it draws closer together than
+    vehicles are wide are no foes to it.
     """
     net = load_map(path)
     drivable = rows(net)
@@ -568,6 +580,9 @@ def test_conflicts_are_the_foes_of_sumo(path):
             through.setdefault(lane, []).append(m)
     ours = {}
     for (lane, foe), found in entries(net).items():
+        i, j = net.lanes[lane], net.lanes[foe]
+        if i.road == j.road and not set(i.successors) & set(j.successors):
+            continue
         for one in through.get(lane, []):
             for two in through.get(foe, []):
                 meeting = [e for e in found if e["type"] != ConflictType.DIVERGE]

@@ -172,8 +172,8 @@ def build_conflicts(
             right before left does when four cars meet; `tie` keeps the rule. Without it, the circles
             stay in `prio`.
 
-    Compared are lanes of the same junction that belong to different roads, and lanes anywhere that
-    share a successor or a predecessor. Outside junctions the 200 m next to the shared lane count.
+    Compared are lanes of the same junction, and lanes anywhere that share a successor or a predecessor.
+    Outside junctions the 200 m next to the shared lane count.
     Lanes more than 3.5 m apart in elevation pass over each other.
 
     Diverging paths need no priority. For the others the first rule that tells them apart decides:
@@ -470,9 +470,7 @@ def _candidates(lanes: Sequence[Lane], curves: _Curves, reach: float) -> list[tu
             inside[lane.junction].append(k)
     for members in inside.values():
         for i, j in itertools.combinations(members, 2):
-            # Lanes of one road lie side by side.
-            if lanes[i].road != lanes[j].road:
-                add(i, j, curves.head)
+            add(i, j, curves.head)
     for links, curve in (("successors", curves.tail), ("predecessors", curves.head)):
         for siblings in _sharing(by_id, links).values():
             for one, two in itertools.combinations(siblings, 2):
@@ -498,7 +496,8 @@ def _classify(network: Network, lanes: Sequence[Lane], overlaps: list[Overlap]) 
     """Tell crossing, merging and diverging stretches apart.
 
     A stretch diverges if both lanes start there and come from the same lane, and merges if both end
-    there and lead to the same lane (or end side by side, closer than vehicles can pass). Where a
+    there and lead to the same lane (or end side by side, closer than vehicles can pass). Lanes of one
+    road that come too close side by side merge there too: vehicles pass one behind the other. Where a
     movement runs over several lanes, the kind carries over from one of them to the next.
     """
     index = {lane.id: k for k, lane in enumerate(lanes)}
@@ -523,7 +522,8 @@ def _classify(network: Network, lanes: Sequence[Lane], overlaps: list[Overlap]) 
         if joins and (not parts or set(i.successors) & set(j.successors)):
             kinds.append(ConflictType.MERGE)
         else:
-            kinds.append(ConflictType.DIVERGE if parts else ConflictType.CROSS)
+            beside = ConflictType.MERGE if i.road == j.road else ConflictType.CROSS
+            kinds.append(ConflictType.DIVERGE if parts else beside)
         by_pair[o.first, o.second].append(n)
 
     def stretch(n: int, k: int) -> tuple[float, float]:
