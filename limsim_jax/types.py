@@ -19,7 +19,7 @@ class Config:
 
     dt: float = struct.field(pytree_node=False)  # s, physics step
     decision_every: int = struct.field(pytree_node=False, default=5)  # physics steps per decision
-    look_ahead: float = struct.field(pytree_node=False, default=150.0)  # m along the route
+    look_ahead: float = struct.field(pytree_node=False, default=300.0)  # m along the route
     look_ahead_lanes: int = struct.field(pytree_node=False, default=4)  # lanes beyond the own one, at least
 
     @property

@@ -114,6 +114,19 @@ def test_a_bend_ahead_is_reached_at_the_speed_that_it_allows():
     assert float(trace["a"].min()) > -2.1
 
 
+def test_who_is_fast_brakes_in_time_for_who_stands():
+    """At 140 km/h towards somebody who stands: the whole way to stop is seen, so nobody brakes hard."""
+    network, lane_map = bundled("highway")
+    row = lane_rows(network)["1_0_-3"]
+    goal = int(np.nonzero(np.asarray(lane_map.routes.reachable)[row])[0][0])
+    driver = dataclasses.replace(drivers(2, speed_factor=1.2), v_max=jnp.asarray([0.0, 60.0], jnp.float32))
+    _, trace = runner("highway", Traffic(lane_changes=False), 60)(
+        state_of("highway", [row] * 2, [600.0, 50.0], [0.0, 39.0], [goal] * 2, driver=driver)
+    )
+    assert float(trace["v"][-1, 1]) < 0.5 and float(trace["s"][-1, 1]) > 570
+    assert float(trace["a"].min()) > -4.5
+
+
 def platoon(model, n=6, v=20.0):
     """Vehicles one behind the other on one lane of the highway; the first one holds them up."""
     network, lane_map = bundled("highway")

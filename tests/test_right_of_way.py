@@ -137,6 +137,23 @@ def test_who_stands_where_others_cross_goes_before_who_can_still_wait():
     assert not meeting(inside, comes | {"y": 7.0}, prio=-1)(blocks=(True, False))
 
 
+def test_who_circulates_does_not_brake_hard_for_who_is_gone_before_it_comes():
+    """A ring whose lanes pass exits and entries: somebody enters 30 m ahead, in a gap of 4 s."""
+    network, lane_map = bundled("roundabout")
+    rows = lane_rows(network)
+    routes = lane_map.routes
+    lane, then = [rows["8_0_-1"], rows["104_0_-1"]], [rows["101_0_-1"], rows["5_0_-1"]]
+    goal = [int(jnp.argmax(routes.next_lane[one] == two)) for one, two in zip(lane, then, strict=True)]
+    state = state_of("roundabout", lane, [3.1, 3.8], [7.2, 6.2], goal)
+
+    def decision(state, _):
+        return drive(CONFIG, Traffic(), lane_map, state, record=lambda tick: (tick.state.a, tick.state.lane))
+
+    a, where = jax.jit(lambda state: jax.lax.scan(decision, state, None, length=14))(state)[1]
+    assert (np.asarray(where[..., 0]) == rows["5_0_-1"]).any(), "they meet"
+    assert float(a.min()) > -2.5
+
+
 def rows_of(line, n):
     one = lambda x, dtype: jnp.asarray(np.stack([x, np.full(n, -1)], -1), dtype)  # noqa: E731
     zero = np.zeros(n)

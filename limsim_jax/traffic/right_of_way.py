@@ -295,11 +295,13 @@ def _meet(
     soon = travel_time(distance_in, me.v, me.fast, me.a)
     halts = (other.stuck > 0) | ((other.slows > 0) & (other.line < -_MARGIN))  # perhaps within the stretch
     cares = there & ~past & ~splits & ~((out + GAP_FOLLOW < soon) & ~halts & ~merges)
-    # merging: behind the other where there is room behind it, and where that asks for less than to stop
+    # merging: behind the other where there is room behind it, and where that asks for less than to wait: before
+    # the stretch, or where only some haste would stop it before the junction, there
     behind = (s_out - me.y) - (f_out - other.y + other.length)
     s0, T, b = (x[vehicle][None] for x in (driver.s0, driver.T, driver.b))
     reach = behind + other.v * other.v / (2 * b)
-    eases = (behind > s0 + 0.5 * T * me.v) & (reach > distance_in)
+    hastes = (me.line > 0) & (me.line + _MARGIN > me.brake) & (me.line < me.brake * BRAKE / _EASY)
+    eases = (behind > s0 + 0.5 * T * me.v) & (reach > jnp.where(hastes, me.line, distance_in))
     follows = merges & (eases | (distance_in <= -_MARGIN))
     # keep clear: nobody enters behind a slow vehicle only to stand where others cross
     clear = (table.cross_s[k][None] - me.y) + me.length + s0
