@@ -29,7 +29,8 @@ from limsim_jax.sweep.runner import Progress, sweep
 from limsim_jax.sweep.store import open_results
 
 RESULTS = Path(__file__).parent / "results"
-POLICIES = ("like_traffic", "pdm_closed", "pdm_hybrid", "limsim_tm")
+POLICIES = ("like_traffic", "pdm_closed", "pdm_hybrid", "limsim_tm", "area_of_interest")
+EVENTS = ("success", "at_fault_contacts", "contacts")
 MEANS = {"completion": "completion", "score": "limsim_faithful_drive", "nuplan": "nuplan_score"}
 
 
@@ -47,10 +48,10 @@ def worlds(policy: str, scenario: str, seeds: int, few: int, out: Path) -> dict[
     found = {
         name: np.asarray(column)
         for name, column in rows.filter(mine).sort_by("seed").to_pydict().items()
-        if name in {"success", "at_fault_contacts", "contacts", "traffic_collided", *MEANS.values()}
+        if name in {*EVENTS, *MEANS.values(), "traffic_collided", "traffic_gridlock"}
     }
     row: dict[str, Any] = {"policy": policy, "scenario": scenario, "seeds": seeds}
-    row |= summary(found) | {"background_collisions": int(found["traffic_collided"].sum())}
+    row |= summary(found)
     if few:
         row["few"] = {"seeds": few} | summary({name: values[:few] for name, values in found.items()})
     return row
@@ -67,17 +68,21 @@ def decisions(policy: str, scenario: str) -> dict[str, Any]:
     }
 
 
-def summary(found: dict[str, np.ndarray]) -> dict[str, list[float]]:
-    """Shares and means with their 95 % intervals; the seed is the unit."""
-    row = {}
-    for name in ("success", "at_fault_contacts", "contacts"):
+def summary(found: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Shares and means with their 95 % intervals, the seed is the unit; and what happened to others."""
+    row: dict[str, Any] = {}
+    for name in EVENTS:
         events, seeds = int(np.sum(found[name] > 0)), len(found[name])
         row[name] = [events / seeds, *wilson(events, seeds)[-2:]]
     for name, column in MEANS.items():
         values = found[column][np.isfinite(found[column])]
         interval = bootstrap(values)
         row[name] = [float(values.mean()), interval.low, interval.high]
-    return row
+    touched = found["contacts"] + (found["contacts"] > 0)  # by the ego, and the ego
+    return row | {
+        "others_collided": int(np.sum(np.maximum(found["traffic_collided"] - touched, 0))),
+        "gridlocks": int(np.sum(found["traffic_gridlock"])),
+    }
 
 
 def main() -> None:

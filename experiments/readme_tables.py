@@ -218,8 +218,8 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
     titles = {"decision_ms": "decision, ms", "amortised_ms": "per vehicle in a batch, ms"}
     times = {name: title for name, title in titles.items() if any(name in r for r in result["rows"])}
     heads = ["scenario", "policy", "seeds", "success, %", "route completion, %", "LimSim driving score",
-             "contact at fault, %", *times.values()]  # fmt: skip
-    rows = [f"| {' | '.join(heads)} |", f"|---|---|---:|---|---:|---|---|{'---:|' * len(times)}"]
+             "contact at fault, %", "others in contact", "gridlocks", *times.values()]  # fmt: skip
+    rows = [f"| {' | '.join(heads)} |", f"|---|---|---:|---|---:|---|---|---:|---:|{'---:|' * len(times)}"]
     parts = [[row, row | row["few"]] if few and "few" in row else [row] for row in result["rows"]]
     for r in itertools.chain.from_iterable(parts):
         (success, low, high), (score, least, most) = ([100 * x for x in r["success"]], r["score"])
@@ -229,7 +229,8 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
         rows.append(
             f"| {r['scenario']} | {r['policy']} | {r['seeds']:,} | {success:.1f} [{low:.1f}, {high:.1f}] "
             f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}]{theirs} "
-            f"| {fault:.1f} (at most {bound:.1f}) |{took}"
+            f"| {fault:.1f} (at most {bound:.1f}) "
+            f"| {r['others_collided']} | {r.get('gridlocks', '')} |{took}"
         )
     return "\n".join(rows)
 

@@ -737,7 +737,8 @@ pasubio_tls.add.xml and every fourth vehicle.
   in minor arms, behind long red phases and missed turns; traffic as a whole goes on.
 - SUMO looks for collisions along lanes. Ours compares bodies, so it also finds those who touch beside
   one another where lanes come close: side by side on the two lanes of 1200363973 in ingolstadt1, which are
-  led 3 m sideways within 8 m, and of 5_2 in bologna_pasubio, whose shapes come within 1.7 m.
+  led 3 m sideways within 8 m, and where vehicles of 12 m turn beside others (4_6 and 29_0 of
+  bologna_pasubio).
 - Vehicles that stand for 300 s are teleported by SUMO. Ours stay, and hold up all behind them.
 """
 
