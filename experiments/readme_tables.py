@@ -76,16 +76,16 @@ def speed(result: dict[str, Any]) -> str:
 def soundness(result: dict[str, Any]) -> str:
     """What went wrong in many episodes."""
     rows = [
-        "| map | episodes | vehicles | vehicle-km | collisions | gridlock | off road | red light "
-        "| missed lane changes | hardest braking, m/s² |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+        "| map | episodes | vehicles | vehicle-km | collisions | two where lanes cross | gridlock | off road "
+        "| red light | missed lane changes | hardest braking, m/s² |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for r in result["maps"]:
         missed, red = (f"{100 * r[name] / r['entered']:.2f} %" for name in ("missed", "ran_red"))
         rows.append(
             f"| {r['map']} | {r['episodes']} | {r['entered']:,} | {r['vehicle_km']:,.0f} "
-            f"| {r['collided_episodes']} | {r['gridlock']} | {r['off_road']} | {red} | {missed} "
-            f"| {r['deceleration']:.1f} |"
+            f"| {r['collided_episodes']} | {r['together']} | {r['gridlock']} | {r['off_road']} "
+            f"| {red} | {missed} | {r['deceleration']:.1f} |"
         )
     return "\n".join(rows)
 

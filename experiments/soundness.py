@@ -17,15 +17,19 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from limsim_jax.bench import build_traffic
 from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, bundled_maps, load_map
+from limsim_jax.maps.conflicts import ConflictTable, ConflictType
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.rollout import Rollout, Worlds, use_all_cores
 from limsim_jax.traffic.demand import sample_scenario
-from limsim_jax.traffic.engine import Traffic
-from limsim_jax.types import Config
+from limsim_jax.traffic.engine import Tick, Traffic
+from limsim_jax.traffic.motion import tails
+from limsim_jax.types import Config, State
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -42,6 +46,52 @@ INITIAL, IN_TOWN = 20, 50  # vehicles at the start, about
 HORIZON = 180.0  # s
 
 
+class Together:
+    """How often two vehicles are in a stretch where their lanes cross at the same time, a `rollout.Measure`.
+
+    The stretch is where centre lines are within 2.3 m, so two may be in it without touching.
+    """
+
+    def __init__(self, table: ConflictTable) -> None:
+        foe, cross = np.asarray(table.foe), np.asarray(table.type) == ConflictType.CROSS
+        places = np.stack([np.asarray(x) for x in (table.s_in, table.s_out, table.f_in, table.f_out)], -1)
+        self.mirror = np.zeros(foe.shape, np.int32)  # place in the flat table of the entry seen from the foe
+        for k, c in zip(*np.nonzero(cross), strict=True):
+            j = foe[k, c]
+            same = (foe[j] == k) & (places[j] == places[k, c][[2, 3, 0, 1]]).all(-1)
+            self.mirror[k, c] = j * foe.shape[1] + int(np.argmax(same))
+
+    def _pairs(self, lane_map: LaneMap, state: State) -> jax.Array:
+        """Entries of the table `[K, C]` with somebody on either side."""
+        table = lane_map.conflicts
+        behind, front = tails(lane_map, state)
+        lane = jnp.concatenate([jnp.where(state.active, state.lane, NO_LANE)[:, None], behind], -1)
+        front = jnp.concatenate([state.s[:, None], front], -1)[..., None]
+        k = jnp.where(lane == NO_LANE, -1, table.connector[lane])
+        inside = (front > table.s_in[k]) & (front - state.shape.length[:, None, None] < table.s_out[k])
+        inside &= (table.type[k] == ConflictType.CROSS) & (k >= 0)[..., None]
+        taken = jnp.zeros(table.foe.shape, bool).at[k].max(inside)
+        return taken & taken.ravel()[self.mirror]
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """Nobody has met yet."""
+        return self._pairs(lane_map, state), jnp.int32(0)
+
+    def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
+        """Who is together after a step."""
+        return self._pairs(lane_map, tick.state)
+
+    def update(self, config: Config, lane_map: LaneMap, carry: Any, looks: Any) -> Any:
+        """Counts those who begin to be."""
+        before, count = carry
+        begun = looks & ~jnp.concatenate([before[None], looks[:-1]])
+        return looks[-1], count + jnp.sum(begun, dtype=jnp.int32) // 2
+
+    def result(self, config: Config, lane_map: LaneMap, carry: Any) -> Any:
+        """How many pairs there were."""
+        return carry[1]
+
+
 def episodes(
     path: str | Path, rate: float, count: int, *, slots: int, chunk: int, initial: int = INITIAL
 ) -> dict[str, Any]:
@@ -49,12 +99,13 @@ def episodes(
     network = load_map(path)
     lane_map = build_lane_map(network)
     demand, _ = build_traffic(network, lane_map, rate=rate, vehicles=initial, seconds=HORIZON)
-    run = Rollout(Config(dt=0.1), Traffic(), HORIZON)
+    run = Rollout(Config(dt=0.1), Traffic(), HORIZON, measure=Together(lane_map.conflicts))
     start = time.perf_counter()
     worlds = Worlds(run, lane_map, lambda key: sample_scenario(demand, lane_map, key, slots), chunk=chunk)
     worlds.compile()
     compiled = time.perf_counter()
-    totals = worlds.run_totals(range(count))
+    parts = [(result.totals, result.measures) for _, result in worlds.chunks(range(count))]
+    totals, together = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     done = time.perf_counter()
     events = {
         name: int(np.sum(getattr(totals, name)))
@@ -69,6 +120,7 @@ def episodes(
         "episodes": count,
         "slots": slots,
         "rate": rate,
+        "together": int(np.sum(together)),
         "collided_episodes": int(np.sum(totals.collided > 0)),
         "off_road_episodes": int(np.sum(totals.off_road > 0)),
         "deceleration": round(float(np.max(totals.deceleration)), 2),
@@ -92,6 +144,7 @@ COLUMNS = {
     "off_road": "off road",
     "wrong_way": "wrong way",
     "ran_red": "red light",
+    "together": "two where lanes cross",
     "missed": "missed lane changes",
     "deceleration": "hardest braking, m/s^2",
     "full": "no slot",

@@ -295,8 +295,8 @@ def _meet(
     soon = travel_time(distance_in, me.v, me.fast, me.a)
     halts = (other.stuck > 0) | ((other.slows > 0) & (other.line < -_MARGIN))  # perhaps within the stretch
     cares = there & ~past & ~splits & ~((out + GAP_FOLLOW < soon) & ~halts & ~merges)
-    # merging: behind the other where there is room behind it, and where that asks for less than to wait: before
-    # the stretch, or where only some haste would stop it before the junction, there
+    # merging: behind the other where there is room behind it, if that asks for less than to wait before
+    # the stretch, or before the junction if only some haste would stop it there
     behind = (s_out - me.y) - (f_out - other.y + other.length)
     s0, T, b = (x[vehicle][None] for x in (driver.s0, driver.T, driver.b))
     reach = behind + other.v * other.v / (2 * b)

@@ -1,0 +1,151 @@
+"""What somebody who watches the traffic would find odd, counted: jumps, slides, hard braking, idle stands.
+
+    python experiments/oddities.py [--worlds 12] [--map NAME_OR_FILE ...]
+
+Background traffic of three minutes per world, every physics step of it. Prints where and when the first few
+of each kind are, to be looked at with `limsim-jax run MAP --seed N --video FILE` and the flows of
+`soundness.py`. Writes experiments/results/oddities.json and .md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from soundness import INITIAL, RATES, RESULTS, SLOTS
+
+from limsim_jax.bench import build_traffic
+from limsim_jax.files import write_whole
+from limsim_jax.maps import build_lane_map, bundled_maps, load_map
+from limsim_jax.maps.lane_map import LaneMap, lane_rows
+from limsim_jax.rollout import Rollout, enable_compilation_cache, one_world
+from limsim_jax.traffic.demand import sample_scenario
+from limsim_jax.traffic.engine import Tick, Traffic
+from limsim_jax.traffic.motion import boxes
+from limsim_jax.types import Config
+
+DT = 0.1
+HORIZON = 180.0  # s
+KINDS = {
+    "jumps": "a body moves 0.25 m more or less than its speed tells",
+    "slides": "a body moves 0.25 rad off its heading",
+    "hard": "begins to brake with more than 5 m/s^2",
+    "stands": "stands for 10 s, not at a line, for nobody within 10 m, and not for the right of way",
+}
+SHOWN = 3
+
+
+class Seen(NamedTuple):
+    """A step, as far as it is looked at."""
+
+    box: Float[Array, "N 5"]
+    active: Bool[Array, " N"]
+    vehicle: Int[Array, " N"]
+    lane: Int[Array, " N"]
+    s: Float[Array, " N"]
+    v: Float[Array, " N"]
+    a: Float[Array, " N"]
+    held: Bool[Array, " N"]
+
+
+def odd(lane_map: LaneMap, seen: Seen) -> dict[str, Bool[np.ndarray, "T N"]]:
+    """Where each kind begins, `[T, N]` steps and slots."""
+    box, v = seen.box, seen.v
+    same = seen.active[1:] & seen.active[:-1] & (seen.vehicle[1:] == seen.vehicle[:-1])
+    dx, dy = (np.diff(box[..., k], axis=0) for k in range(2))
+    moved = np.hypot(dx, dy)
+    off = np.abs(np.angle(np.exp(1j * (np.arctan2(dy, dx) - box[1:, :, 2]))))
+    standing = np.zeros(v.shape, bool)
+    still = np.zeros(v.shape[1], int)
+    to_line = np.asarray(lane_map.stop_s)[seen.lane] - seen.s
+    for t in range(len(v)):
+        still = np.where(seen.active[t] & (v[t] < 0.3), still + 1, 0)
+        for n in np.nonzero(still == round(10 / DT))[0]:
+            c, s = np.cos(box[t, n, 2]), np.sin(box[t, n, 2])
+            x, y = box[t, :, 0] - box[t, n, 0], box[t, :, 1] - box[t, n, 1]
+            ahead, across = c * x + s * y, c * y - s * x
+            near = (ahead > 0.5) & (ahead < (box[t, n, 3] + box[t, :, 3]) / 2 + 10) & (np.abs(across) < 2)
+            at_line = -2 < to_line[t, n] < 3
+            standing[t, n] = not (near & seen.active[t]).any() and not at_line and not seen.held[t, n]
+    happens = {
+        "jumps": same & (np.abs(moved - DT * (v[1:] + v[:-1]) / 2) > 0.25),
+        "slides": same & (moved > 0.15) & (off > 0.25),
+        "hard": same & (seen.a[1:] < -5),
+    }
+    first = {k: np.concatenate([x[:1], x[1:] & ~x[:-1]]) for k, x in happens.items()}
+    return {k: np.concatenate([np.zeros((1, v.shape[1]), bool), x]) for k, x in first.items()} | {
+        "stands": standing
+    }
+
+
+def watch(name: str, worlds: int) -> dict[str, Any]:
+    """Watch some worlds on a map."""
+    network = load_map(bundled_maps().get(name) or name)
+    lane_map = build_lane_map(network)
+    lanes = list(lane_rows(network))
+    demand, _ = build_traffic(
+        network, lane_map, rate=RATES.get(name, 200.0), vehicles=INITIAL, seconds=HORIZON
+    )
+    slots = SLOTS.get(name, 64)
+
+    def record(lane_map: LaneMap) -> Any:
+        def look(tick: Tick) -> Seen:
+            x = tick.state
+            return Seen(boxes(lane_map, x), x.active, x.vehicle, x.lane, x.s, x.v, x.a, x.held)
+
+        return look
+
+    run = Rollout(Config(dt=DT), Traffic(), HORIZON, record=record)
+    go = jax.jit(
+        lambda seed: one_world(run, lane_map, lambda key: sample_scenario(demand, lane_map, key, slots), seed)
+    )
+    counts: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
+    km = 0.0
+    for seed in range(worlds):
+        result = jax.device_get(go(seed))
+        seen, km = result.trace, km + float(result.totals.distance) / 1000
+        for kind, where in odd(lane_map, seen).items():
+            for t, n in np.argwhere(where):
+                counts[kind] += 1
+                if counts[kind] <= SHOWN:
+                    place = f"{lanes[seen.lane[t, n]]} at {seen.s[t, n]:.1f} m, {seen.v[t, n]:.1f} m/s"
+                    print(f"{name} seed {seed} {(t + 1) * DT:.1f} s slot {n}: {kind} on {place}", flush=True)
+    return {"map": Path(name).stem, "worlds": worlds, "vehicle_km": round(km, 1)} | counts
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown."""
+    lines = [
+        "| map | worlds | vehicle-km | " + " | ".join(KINDS) + " |",
+        "|---|" + "---:|" * (2 + len(KINDS)),
+    ]
+    for r in rows:
+        counts = " | ".join(str(r[kind]) for kind in KINDS)
+        lines.append(f"| {r['map']} | {r['worlds']} | {r['vehicle_km']:,.0f} | {counts} |")
+    return "\n".join([*lines, "", *(f"- {kind}: {what}" for kind, what in KINDS.items())])
+
+
+def main() -> None:
+    """Watch and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--worlds", type=int, default=12)
+    parser.add_argument("--map", nargs="*", default=list(bundled_maps()))
+    options = parser.parse_args()
+    enable_compilation_cache()
+    rows = []
+    for name in options.map:
+        rows.append(watch(name, options.worlds))
+        print(json.dumps(rows[-1]), flush=True)
+    write_whole(RESULTS / "oddities.json", json.dumps({"maps": rows}, indent=1) + "\n")
+    head = "Regenerate: `python experiments/oddities.py`\n\n"
+    write_whole(RESULTS / "oddities.md", f"{head}{table(rows)}\n")
+
+
+if __name__ == "__main__":
+    main()
