@@ -4,7 +4,7 @@
 
 Background traffic of three minutes per world, every physics step of it. Prints where and when the first few
 of each kind are, to be looked at with `limsim-jax run MAP --seed N --video FILE` and the flows of
-`soundness.py`. Writes experiments/results/oddities.json and .md.
+`soundness.py`. Writes experiments/results/oddities.json and .md; maps that are not named keep their rows.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from soundness import INITIAL, RATES, RESULTS, SLOTS
+from soundness import HORIZON, INITIAL, OTHER_RATE, RATES, RESULTS, SLOTS
 
 from limsim_jax.bench import build_traffic
 from limsim_jax.files import write_whole
@@ -31,7 +31,6 @@ from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config
 
 DT = 0.1
-HORIZON = 180.0  # s
 KINDS = {
     "jumps": "a body moves 0.25 m more or less than its speed tells",
     "slides": "a body moves 0.25 rad off its heading",
@@ -90,7 +89,7 @@ def watch(name: str, worlds: int) -> dict[str, Any]:
     lane_map = build_lane_map(network)
     lanes = list(lane_rows(network))
     demand, _ = build_traffic(
-        network, lane_map, rate=RATES.get(name, 200.0), vehicles=INITIAL, seconds=HORIZON
+        network, lane_map, rate=RATES.get(name, OTHER_RATE), vehicles=INITIAL, seconds=HORIZON
     )
     slots = SLOTS.get(name, 64)
 
@@ -137,14 +136,18 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=12)
     parser.add_argument("--map", nargs="*", default=list(bundled_maps()))
     options = parser.parse_args()
+    if options.worlds < 1:
+        parser.error(f"--worlds {options.worlds}: at least 1")
     enable_compilation_cache()
-    rows = []
+    file = RESULTS / "oddities.json"
+    rows = {row["map"]: row for row in json.loads(file.read_text())["maps"]} if file.exists() else {}
     for name in options.map:
-        rows.append(watch(name, options.worlds))
-        print(json.dumps(rows[-1]), flush=True)
-    write_whole(RESULTS / "oddities.json", json.dumps({"maps": rows}, indent=1) + "\n")
+        row = watch(name, options.worlds)
+        rows[row["map"]] = row
+        print(json.dumps(row), flush=True)
+    write_whole(file, json.dumps({"maps": list(rows.values())}, indent=1) + "\n")
     head = "Regenerate: `python experiments/oddities.py`\n\n"
-    write_whole(RESULTS / "oddities.md", f"{head}{table(rows)}\n")
+    write_whole(RESULTS / "oddities.md", f"{head}{table(list(rows.values()))}\n")
 
 
 if __name__ == "__main__":

@@ -164,6 +164,14 @@ def test_lanes_of_one_road_that_come_too_close_merge(apart):
     assert entries(network([a, b]))["a", "b"][0]["type"] == ConflictType.CROSS
 
 
+def test_oncoming_lanes_and_other_sections_of_one_road_are_apart():
+    a = straight("a", (0, 0), 0.0, 30.0, road="r", junction="J")
+    oncoming = straight("b", (30, 2.0), math.pi, 30.0, road="r", number=1, junction="J")
+    beyond = straight("b", (30, 1.75), 0.0, 30.0, road="r", section=1, junction="J")
+    assert not entries(network([a, oncoming])) and not entries(network([a, beyond]))
+    assert entries(network([a, dataclasses.replace(oncoming, road="other")]))
+
+
 def test_a_lane_does_not_conflict_with_what_follows_it():
     a = straight("a", (0, 0), 0.0, 20.0, junction="J", successors=("b",))
     b = straight("b", (20, 0), 0.0, 1.0, junction="J", successors=("c",))

@@ -172,8 +172,8 @@ def build_conflicts(
             right before left does when four cars meet; `tie` keeps the rule. Without it, the circles
             stay in `prio`.
 
-    Compared are lanes of the same junction, and lanes anywhere that share a successor or a predecessor.
-    Outside junctions the 200 m next to the shared lane count.
+    Compared are lanes of the same junction, of one road only those side by side, and lanes anywhere that
+    share a successor or a predecessor. Outside junctions the 200 m next to the shared lane count.
     Lanes more than 3.5 m apart in elevation pass over each other.
 
     Diverging paths need no priority. For the others the first rule that tells them apart decides:
@@ -470,7 +470,9 @@ def _candidates(lanes: Sequence[Lane], curves: _Curves, reach: float) -> list[tu
             inside[lane.junction].append(k)
     for members in inside.values():
         for i, j in itertools.combinations(members, 2):
-            add(i, j, curves.head)
+            # Of one road only lanes side by side: the others follow each other, or are oncoming.
+            if lanes[i].road != lanes[j].road or lanes[i].carriageway == lanes[j].carriageway:
+                add(i, j, curves.head)
     for links, curve in (("successors", curves.tail), ("predecessors", curves.head)):
         for siblings in _sharing(by_id, links).values():
             for one, two in itertools.combinations(siblings, 2):
@@ -522,7 +524,7 @@ def _classify(network: Network, lanes: Sequence[Lane], overlaps: list[Overlap]) 
         if joins and (not parts or set(i.successors) & set(j.successors)):
             kinds.append(ConflictType.MERGE)
         else:
-            beside = ConflictType.MERGE if i.road == j.road else ConflictType.CROSS
+            beside = ConflictType.MERGE if i.carriageway == j.carriageway else ConflictType.CROSS
             kinds.append(ConflictType.DIVERGE if parts else beside)
         by_pair[o.first, o.second].append(n)
 
@@ -663,7 +665,7 @@ class _RightOfWay:
                 self.through[name].append(movement)
             if not movement.via:
                 self.direct[movement.incoming].append(movement)
-        self.road_lanes = Counter(map(_carriageway, network.drivable_lanes()))
+        self.road_lanes = Counter(lane.carriageway for lane in network.drivable_lanes())
         on_ring = ring_lanes(network, lanes)
         self.from_ring = [bool(on_ring & {lane.id, *lane.predecessors}) for lane in lanes]
         self._paths: dict[int, list[_Path]] = {}
@@ -697,7 +699,7 @@ class _RightOfWay:
             turn=turn,
             control=movement.control if movement is not None else Control.NONE,
             ramp=source.type in _RAMPS or lane.type in _RAMPS,
-            size=(self.road_lanes[_carriageway(source)], source.speed_limit),
+            size=(self.road_lanes[source.carriageway], source.speed_limit),
             left_hand=road.left_hand if road is not None else False,
         )
 
@@ -749,11 +751,6 @@ class _RightOfWay:
 
 def _sign(x: int) -> int:
     return (x > 0) - (x < 0)
-
-
-def _carriageway(lane: Lane) -> tuple[str, int, bool]:
-    """Lanes with the same key lie side by side in the same direction."""
-    return lane.road, lane.section, lane.number < 0
 
 
 def _turn(angle: float) -> Turn:

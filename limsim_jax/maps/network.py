@@ -239,6 +239,11 @@ class Lane:
     junction: str | None = None  # the junction whose area it crosses: then it is a connector
 
     @property
+    def carriageway(self) -> tuple[str, int, bool]:
+        """Lanes with the same key lie side by side in the same direction."""
+        return self.road, self.section, self.number < 0
+
+    @property
     def length(self) -> float:
         """Arc length of the centre line, m."""
         return float(self.s[-1])

@@ -107,8 +107,8 @@ def default_goals(network: Network) -> dict[str, tuple[str, ...]]:
     ways (OpenDRIVE).
     """
     lanes = {lane.id: lane for lane in network.drivable_lanes()}
-    go_on = {_carriageway(lane) for lane in lanes.values() if any(name in lanes for name in lane.successors)}
-    ends = [lane for lane in lanes.values() if _carriageway(lane) not in go_on]
+    go_on = {lane.carriageway for lane in lanes.values() if any(name in lanes for name in lane.successors)}
+    ends = [lane for lane in lanes.values() if lane.carriageway not in go_on]
     if not ends:
         ends = [
             lane
@@ -123,11 +123,6 @@ def default_goals(network: Network) -> dict[str, tuple[str, ...]]:
         name = lane.road + (("-" if lane.number < 0 else "+") if both else "")
         goals[name] = (*goals.get(name, ()), lane.id)
     return goals
-
-
-def _carriageway(lane: Lane) -> tuple[str, int, bool]:
-    """Lanes with the same key lie side by side in the same direction."""
-    return lane.road, lane.section, lane.number < 0
 
 
 def build_routes(
