@@ -17,11 +17,13 @@ from limsim_jax.policies.limsim_tm.decide import corridor, grouped
 from limsim_jax.policies.limsim_tm.plan import room_needed
 from limsim_jax.policies.limsim_tm.search import Settings
 from limsim_jax.policies.pdm import PDMClosed
-from limsim_jax.policies.predict import straight
+from limsim_jax.policies.predict import constant_velocity, straight
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.rollout import Rollout, one_world, trace
 from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, entries, sample_scenario
+from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.engine import Traffic
+from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.vehicles import default_population, fitting
 from limsim_jax.types import Config
 
@@ -101,6 +103,35 @@ def test_an_ego_gets_through_traffic():
     a = np.asarray(result.trace.a[:, :, 0])
     assert a.min() > -4.5 and a.max() < 3.0
     assert np.isfinite(result.trace.box).all()
+
+
+def test_who_is_planned_for_knows_what_the_others_chose():
+    lane_map = bundled("ramp")[1]
+    lane = entrance()[1]
+    state = state_of("ramp", [lane] * 3, [60.0, 110.0, 160.0], [20.0, 14.0, 20.0], [0] * 3)
+    egos = from_lane(lane_map, state, boxes(lane_map, state), [0, 1], True)
+    state = replace(state, egos=egos)
+    asked = []
+
+    def spied(lane_map, state, times, *, stop=None, plans=None):
+        asked.append(plans)
+        return constant_velocity(lane_map, state, times, stop=stop, plans=plans)
+
+    config = Config(dt=0.1)
+    policy = LimSimTM(search=None, predict=spied)
+
+    @jax.jit
+    def decide(memory):
+        command, memory = policy(config, lane_map, state, memory, jax.random.key(0))
+        return command, memory, asked.pop()
+
+    command, memory, first = decide(policy.init(config, lane_map, state))
+    _, _, second = decide(memory)
+    np.testing.assert_array_equal(first.slot, [-1, -1])  # nothing chosen yet
+    np.testing.assert_array_equal(second.slot, [0, 1])
+    np.testing.assert_allclose(second.x, command.trajectory.x, atol=1e-3)
+    np.testing.assert_allclose(second.y, command.trajectory.y, atol=1e-3)
+    assert replace(policy, shares=False).init(config, lane_map, state).plan is None
 
 
 def test_each_module_has_a_reference():

@@ -90,12 +90,14 @@ def loop_idm(v, limit, front, wide, half, seen, wall, strict):
                         at = xi - c * length / 2 - n * 0.9
                         if abs(yi - offset) < beside and s + half < xi and 0 < xi < 240 and at < rear:
                             rear, u_lead = at, u[i] * np.cos(heading[i])
-                s0 = 1.0 if strict else 1.5
-                gap = max(rear - s - front, s0)
+                s0, least = (1.0, 1.0) if strict else (2.0, 0.1)
+                gap = max(rear - s - front, least)
                 wish = s0 + 1.5 * speed + speed * (speed - u_lead) / (2 * np.sqrt(1.5 * 3.0))
                 wish = wish if strict else max(wish, 0.0)
                 a = 1.5 * (1 - (speed / (fraction * limit)) ** 10 - (wish / gap) ** 2)
                 a = -3.0 if strict and k == 0 else min(max(a, -3.0), 1.5)
+                if not strict and rear < wall and 1.5 * (1 - (wish / gap) ** 2) < -3.0:
+                    a = max(1.5 * (1 - (wish / gap) ** 2), -6.0)
                 s, speed = s + speed * 0.1, speed + a * 0.1
                 speed = speed if strict else max(speed, 0.0)
                 path.append((s, speed))

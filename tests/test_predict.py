@@ -9,7 +9,16 @@ import pytest
 from traffic_worlds import bundled, scattered
 
 from limsim_jax.maps.lane_map import width
-from limsim_jax.policies.predict import Plans, Recalled, constant_velocity, hypotheses, nearest, straight
+from limsim_jax.policies.predict import (
+    Plans,
+    Recalled,
+    constant_velocity,
+    hypotheses,
+    nearest,
+    shared,
+    straight,
+)
+from limsim_jax.traffic.ego import Trajectory
 from limsim_jax.traffic.motion import advance, boxes
 from limsim_jax.types import Config
 
@@ -107,6 +116,42 @@ def test_plans_override_those_they_are_for():
     np.testing.assert_array_equal(found.x[4], line[0])
     np.testing.assert_array_equal(found.y[4], line[0] + 1)
     others = np.delete(np.arange(N), 4)
+    np.testing.assert_array_equal(np.asarray(found.x)[others], np.asarray(free.x)[others])
+
+
+def test_what_is_shared_goes_on_from_where_the_vehicle_is():
+    state, lane_map = world("roundabout", 1), bundled("roundabout")[1]
+    box = np.asarray(boxes(lane_map, state))
+    # chosen at 7 s, it is 7.5 s now: an arc of 30 m to the left, at 6 m/s, for 4 s
+    t, radius, v = np.arange(9) * 0.5, 30.0, 6.0
+
+    def arc(row, at, turned):
+        angle = box[row, 2] + turned + v * at / radius
+        x = box[row, 0] + radius * (np.sin(angle) - np.sin(box[row, 2]))
+        y = box[row, 1] - radius * (np.cos(angle) - np.cos(box[row, 2]))
+        return np.stack([x, y, np.remainder(angle + np.pi, 2 * np.pi) - np.pi, 0 * at + v])
+
+    begun = -v * 0.5 / radius  # half a second ago it was that much short of its heading
+    rows = np.stack([arc(k, t, begun) for k in (3, 5, 6, 7)])
+    rows[0, 0] += 0.7  # driven to one side of it
+    rows[2, 1] += 3.0  # strayed
+    x, y, heading, speed = (jnp.asarray(rows[:, k], jnp.float32) for k in range(4))
+    plan = Trajectory(x=x, y=y, heading=heading, v=speed, t0=jnp.float32(7.0), dt=0.5)
+    slot = jnp.asarray([3, 5, 6, -1])
+    plans = shared(lane_map, state, slot, plan, jnp.float32(7.5), TIMES)
+    np.testing.assert_array_equal(plans.slot, [3, 5, -1, -1])
+    found, free = predict(lane_map, state, TIMES, plans=plans), predict(lane_map, state, TIMES)
+    for k, row in enumerate((3, 5)):
+        ahead = arc(row, np.asarray(TIMES), 0.0)
+        over = (
+            v * 0.5 * np.stack([np.cos(ahead[2, 7]), np.sin(ahead[2, 7])])
+        )  # its last half second: straight on
+        ahead[:2, 8], ahead[2, 8] = ahead[:2, 7] + over, ahead[2, 7]
+        np.testing.assert_allclose(found.x[row], ahead[0], atol=2e-3, err_msg=str(k))
+        np.testing.assert_allclose(found.y[row], ahead[1], atol=2e-3)
+        turned = np.asarray(found.heading[row]) - ahead[2]
+        np.testing.assert_allclose(np.remainder(turned + np.pi, 2 * np.pi) - np.pi, 0, atol=1e-4)
+    others = np.delete(np.arange(N), [3, 5])
     np.testing.assert_array_equal(np.asarray(found.x)[others], np.asarray(free.x)[others])
 
 

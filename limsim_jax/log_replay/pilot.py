@@ -15,10 +15,9 @@ from limsim_jax.geometry import wrap_angle
 from limsim_jax.log_replay.scene import Scene
 from limsim_jax.log_replay.takeover import Ego, Flight, Moment
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, to_frenet
-from limsim_jax.numerics import interval
 from limsim_jax.policies.base import Policy
 from limsim_jax.traffic.demand import start_state
-from limsim_jax.traffic.ego import Control, Limits, Trajectory, step_free, track
+from limsim_jax.traffic.ego import Control, Limits, step_free, track
 from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, Egos, Shape, State
 
@@ -117,7 +116,7 @@ class PolicyPilot:
         then = time + dt + _GRID * jnp.arange(1, PLANNED + 1, dtype=time.dtype)
         plan = _straight(place, moved.v[0])
         if command.trajectory is not None:
-            plan = jnp.where(knows, _sampled(command.trajectory, then), plan)
+            plan = jnp.where(knows, command.trajectory.at(then)[0, :, :3], plan)
         return Flight(
             flying=flying, x=place[0], y=place[1], heading=place[2], v=moved.v[0], a=moved.a[0], plan=plan,
             memory=_Memory(moved, command, policy),
@@ -182,22 +181,6 @@ def _straight(place: Array, v: Array) -> Array:
     way = v * _GRID * jnp.arange(1, PLANNED + 1, dtype=v.dtype)
     heading = jnp.full_like(way, place[2])
     return jnp.stack([place[0] + way * jnp.cos(heading), place[1] + way * jnp.sin(heading), heading], -1)
-
-
-def _sampled(trajectory: Trajectory, time: Float[Array, " H"]) -> Array:
-    """x, y, heading of the trajectory of the only ego; beyond its end at the last speed."""
-    last = trajectory.x.shape[-1] - 1
-    at = (time - trajectory.t0) / trajectory.dt
-    k, u = interval(at, last)
-    u = jnp.clip(u, 0, 1)
-    beyond = jnp.maximum(at - last, 0) * trajectory.dt
-    values = [jnp.unwrap(z) if name == "heading" else z for name, z in _rows(trajectory)]
-    x, y, heading, v = (z[k] + u * (z[k + 1] - z[k]) for z in values)
-    return jnp.stack([x + beyond * v * jnp.cos(heading), y + beyond * v * jnp.sin(heading), heading], -1)
-
-
-def _rows(trajectory: Trajectory) -> list[tuple[str, Array]]:
-    return [(name, getattr(trajectory, name)[0]) for name in ("x", "y", "heading", "v")]
 
 
 __all__ = ["PLANNED", "PolicyPilot"]

@@ -225,14 +225,8 @@ def _joined(first: Command, second: Command, egos: Egos) -> Command:
         values = [jnp.zeros((rows, much.x.shape[1]), much.x.dtype)] * 4
         meta = None if first.meta is None else jnp.concatenate([first.meta, jnp.full(much.x.shape[0], -1)])
     else:
-        at = jnp.clip(
-            (jnp.arange(much.x.shape[1]) * much.dt + much.t0 - mine.t0) / mine.dt, 0, mine.x.shape[1] - 1
-        )
-        k = jnp.minimum(at.astype(jnp.int32), mine.x.shape[1] - 2)
-        u = at - k.astype(at.dtype)
-        values = [
-            z[:, k] + u * (z[:, k + 1] - z[:, k]) for z in (mine.x, mine.y, jnp.unwrap(mine.heading), mine.v)
-        ]
+        found = mine.at(much.t0 + much.dt * jnp.arange(much.x.shape[1], dtype=much.x.dtype))
+        values = [found[..., k] for k in range(4)]
         meta = None
     x, y, heading, v = (
         jnp.concatenate([a, b]) for a, b in zip(values, (much.x, much.y, much.heading, much.v), strict=True)

@@ -14,7 +14,8 @@ By default a few things differ from the public implementation, whose conventions
 =====================  ====================================  =======================================
 leader at the start    known                                 none: all brake hard for 0.1 s
 speed                  not below 0                           may fall below 0 for a moment
-standstill gap         1.5 m                                 1 m
+standstill gap         2 m; who is nearer brakes hard        1 m; who is nearer brakes as at that gap
+braking limit          6 m/s^2 behind others, else 3         3 m/s^2
 speed limit            where the proposal is by then         of the lane at the start
 path                   led from where the vehicle is,        one metre aside at once
                        with all of the body on the road
@@ -25,6 +26,7 @@ lights                 red, and yellow that one can obey     red
 edge of the road       0.1 m of the 0.3 m that nuPlan's      to the centimetre
                        own metric allows
 profiles to track      those of the IDM and of the path      least squares over the poses
+errors in bends        against the path beside the vehicle   against the pose of that time
 bicycle                moves along its mean heading          moves along its heading before (Euler)
 scores                 equal within 0.001                    exact
 emergency braking      at any speed, 7 m/s^2 along the       up to 5 m/s, poses straight on at a
@@ -75,8 +77,8 @@ OFFSETS = (0.0, -1.0, 1.0)
 S0, HEADWAY, ACCELERATION, DECELERATION, HARDEST = 1.0, 1.5, 1.5, 3.0, 3.0
 """IDM: standstill gap (m), time gap (s), acceleration, comfortable deceleration, braking limit (m/s^2)."""
 
-LATE_STOP = 0.5
-"""m that the tracker may need beyond that: added to the standstill gap unless strict."""
+LATE_STOP, HARDEST_BEHIND = 1.0, 6.0
+"""Unless strict: m that the tracker needs beyond the standstill gap; braking limit behind others (m/s^2)."""
 
 COMFORT = {
     "acceleration": (-4.05, 2.40),  # m/s^2
@@ -103,6 +105,7 @@ _LANES = 6  # of the way, beyond the first
 _LOOK = 10  # steps that the tracker looks ahead
 _EVERY = 2  # steps between two looks at the others
 _FAR = 1e6  # m
+_LEAST_GAP = 0.1  # m: who is nearer than the standstill gap brakes as hard as it can
 _STANDS = 0.05  # m/s: who is slower stands (nuPlan)
 _MERGE_TIME, _MERGE_LEAST = 3.0, 12.0  # s and m in which a path comes to an offset 2 m away, or farther,
 _KEEP_SHARE = 0.33  # and the least share of that for one that is nearer
@@ -389,9 +392,10 @@ def idm(road: Road, body: Body, along: _Along, strict: bool) -> Proposals:
     centre = body.wheelbase[:, None, None] / 2
     root = 2 * (ACCELERATION * DECELERATION) ** 0.5
     s0 = S0 if strict else S0 + LATE_STOP
+    wall = road.wall[..., None]
 
     def acceleration(s: Array, v: Array, at: Array, v_lead: Array, v0: Array) -> Array:
-        gap = jnp.maximum(at - s - front, s0)
+        gap = jnp.maximum(at - s - front, s0 if strict else _LEAST_GAP)
         wish = s0 + HEADWAY * v + v * (v - v_lead) / root
         wish = wish if strict else jnp.maximum(wish, 0)
         ratio = v / v0
@@ -399,7 +403,12 @@ def idm(road: Road, body: Body, along: _Along, strict: bool) -> Proposals:
         ratio4 = ratio2 * ratio2
         free = ratio4 * ratio4 * ratio2
         z = wish / gap
-        return jnp.clip(ACCELERATION * (1 - free - z * z), -HARDEST, ACCELERATION)
+        a = jnp.clip(ACCELERATION * (1 - free - z * z), -HARDEST, ACCELERATION)
+        if strict:
+            return a
+        # red lights and limits are known from afar, what a leader does is not
+        behind = jnp.maximum(ACCELERATION * (1 - z * z), -HARDEST_BEHIND)
+        return jnp.where(at < wall, jnp.minimum(a, behind), a)
 
     def look(carry: tuple[Array, ...], seen: _Along) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
         s, v, first = carry
@@ -408,7 +417,6 @@ def idm(road: Road, body: Body, along: _Along, strict: bool) -> Proposals:
         rear = jnp.where(ahead, seen.rear[:, :, None], _FAR)  # [V 3 5 K]
         nearest_rear = jnp.min(rear, -1)
         v_rear = jnp.max(jnp.where(rear <= nearest_rear[..., None], seen.v[:, None, None], -_FAR), -1)
-        wall = road.wall[..., None]
         at = jnp.minimum(nearest_rear, wall)
         v_lead = jnp.where(nearest_rear < wall, v_rear, 0)
         if strict:
@@ -596,8 +604,12 @@ def drive_along(reference: Reference, body: Body, steps: int, strict: bool = Fal
         x, y, heading, v, a, steering = carry
         x0, y0, along, v_ref, bends = now
         cos, sin = jnp.cos(along), jnp.sin(along)
-        lateral = cos * (y - y0) - sin * (x - x0)
-        wish, rate = lqr(v, steering, lateral, wrap_angle(heading - along), v_ref, list(bends), wheelbase)
+        lateral, astray = cos * (y - y0) - sin * (x - x0), wrap_angle(heading - along)
+        if not strict:
+            # who is early or late is where the reference is at another time, and that is round the bend
+            early = cos * (x - x0) + sin * (y - y0)
+            lateral, astray = lateral - bends[0] * early * early / 2, astray - bends[0] * early
+        wish, rate = lqr(v, steering, lateral, astray, v_ref, list(bends), wheelbase)
         a = a + lag_a * (wish - a)
         turned = lag_steering * rate * DT
         turn = v * jnp.tan(steering) / wheelbase * DT

@@ -1,8 +1,9 @@
 """Where others will be: predictions of all vehicles as arrays, for planners to keep clear of.
 
 A `Predictor` is a function; a planner takes any. Here are: `constant_velocity` along the route, `straight`
-along the heading, as in PDM (Dauner et al., CoRL 2023), and `Recalled`, what came to pass. `hypotheses` has
-several futures of a vehicle where lanes split. Without gradient through which lane a vehicle is on.
+along the heading, as in PDM (Dauner et al., CoRL 2023), and `Recalled`, what came to pass. They take over
+what planned vehicles let others know, see `shared`. `hypotheses` has several futures of a vehicle where lanes
+split. Without gradient through which lane a vehicle is on.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s
 from limsim_jax.numerics import computed_once, safe_divide
 from limsim_jax.traffic.collision import CLEARANCE, level
-from limsim_jax.traffic.ego import is_free
+from limsim_jax.traffic.ego import Trajectory, is_free
 from limsim_jax.traffic.motion import CREEP_SPEED, boxes, smooth_step
 from limsim_jax.types import State
 
@@ -30,6 +31,7 @@ STOPPING = 2.0
 """m/s^2, braking before a place to stop, or what it takes if that is more."""
 
 _LANES = 4  # lanes beyond the own one that are looked at
+_STRAYED = 2.0  # m
 
 
 @struct.dataclass(frozen=True, kw_only=True)
@@ -132,7 +134,36 @@ def straight(
     return _with(prediction, plans)
 
 
-@jax.named_scope("hypotheses")
+def shared(
+    lane_map: LaneMap,
+    state: State,
+    slot: Int[Array, " V"],
+    trajectory: Trajectory,
+    now: Float[Array, ""],
+    times: Float[Array, " H"],
+) -> Plans:
+    """Where the vehicles in these slots will be that go on with the trajectories they have chosen before.
+
+    They do so from where they are now. Who is more than `_STRAYED` m off its trajectory by now, or inactive,
+    follows it no longer: nothing is known of it.
+
+    Args:
+      lane_map: where.
+      state: the world now.
+      slot: whose trajectories they are; -1: nobody's.
+      trajectory: of `V` rows; far away where there is none.
+      now: s.
+      times: s from now.
+    """
+    box = boxes(lane_map, state)[slot, :3]
+    here = trajectory.at(now[None])[:, 0, :3]
+    moved = trajectory.at(now + times)[..., :3] - here[:, None]
+    away = jnp.abs(box[:, :2] - here[:, :2]).max(-1)
+    follows = (slot >= 0) & state.active[slot] & (away < _STRAYED)
+    x, y, heading = (jnp.where(follows[:, None], box[:, k, None] + moved[..., k], 0) for k in range(3))
+    return Plans(slot=jnp.where(follows, slot, -1), x=x, y=y, heading=heading)
+
+
 @dataclass(frozen=True)
 class Recalled:
     """What came to pass: a predictor for worlds that run a second time.
@@ -172,6 +203,7 @@ class Recalled:
         return _with(prediction, plans)
 
 
+@jax.named_scope("hypotheses")
 def hypotheses(
     lane_map: LaneMap,
     state: State,

@@ -431,6 +431,22 @@ class Trajectory:
     t0: Float[Array, ""]  # s, time of the first sample
     dt: float = struct.field(pytree_node=False, default=0.1)  # s between samples
 
+    def at(self, time: Float[Array, " M"]) -> Float[Array, "E M 4"]:
+        """x, y (m), heading (rad, without jumps) and v (m/s) at these times (s).
+
+        Linear between samples; before the first one as at it, beyond the last straight on at its speed.
+        """
+        last = self.x.shape[-1] - 1
+        place = jnp.maximum((time - self.t0) / self.dt, 0)[None]
+        k, u = interval(place, last)
+        k, u = k[0], jnp.clip(u, 0, 1)
+        beyond = jnp.maximum(place - last, 0) * self.dt
+        x, y, heading, v = (
+            z[:, k] + u * (z[:, k + 1] - z[:, k]) for z in (self.x, self.y, jnp.unwrap(self.heading), self.v)
+        )
+        way = beyond * v
+        return jnp.stack([x + way * jnp.cos(heading), y + way * jnp.sin(heading), heading, v], -1)
+
 
 _LOOK = 0.8  # s: the lateral error fades with v * _LOOK m as its length scale ...
 _LEAST_LOOK = 3.0  # m: ... but no less

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from limsim_jax.policies.limsim_tm.decide import Told, grouped, neighbours, tell
 from limsim_jax.policies.limsim_tm.plan import Lattice, Merge, Others, Task, plan, room_needed
 from limsim_jax.policies.limsim_tm.search import Settings, no_plan, shifted
 from limsim_jax.policies.perception import Around, around, rules
-from limsim_jax.policies.predict import Prediction, Predictor, constant_velocity
+from limsim_jax.policies.predict import Prediction, Predictor, constant_velocity, shared
 from limsim_jax.policies.reference import Way, beside, body_lane, motion_on, way_ahead
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.traffic.car_following import NO_GAP
@@ -35,6 +36,7 @@ class Memory(NamedTuple):
     side: Int[Array, " E"]  # lane change under way: 1 left, -1 right, 0 none
     told: Told  # by the last search
     since: Float[Array, " E"]  # s, time of that search
+    plan: Trajectory | None  # of each of them, for the others to know
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class LimSimTM:
       search_every: decisions from one search to the next.
       obedience: desired speed of the egos, as a share of the speed limit at most.
       predict: where the others will be.
+      shares: whether vehicles that are planned for know each other's trajectories of the decision before.
       lattice: of trajectories.
       traffic: rules of the road, and how drivers follow each other.
     """
@@ -58,6 +61,7 @@ class LimSimTM:
     search_every: int = 3
     obedience: float = 0.985
     predict: Predictor = constant_velocity
+    shares: bool = True
     lattice: Lattice = field(default_factory=Lattice)
     traffic: Traffic = field(default_factory=Traffic)
 
@@ -73,7 +77,7 @@ class LimSimTM:
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Memory:
         """No lane change under way, nothing searched."""
-        del config, lane_map
+        del lane_map
         rows = state.egos.slot.shape[0]
         size = Settings() if self.search is None else self.search
         told = Told(
@@ -81,7 +85,15 @@ class LimSimTM:
             v=jnp.full((rows, size.steps + 1), _ANY_SPEED),
             action=no_plan(rows, size.decisions),
         )
-        return Memory(state.egos.slot, jnp.zeros_like(state.egos.slot), told, jnp.full(rows, -1e3))
+        nothing = jnp.full((rows, self.lattice.moments), _FAR)
+        plan = Trajectory(
+            x=nothing, y=nothing, heading=nothing, v=nothing,
+            t0=config.time(state.step), dt=self.lattice.dt,
+        )  # fmt: skip
+        return Memory(
+            state.egos.slot, jnp.zeros_like(state.egos.slot), told, jnp.full(rows, -1e3),
+            plan if self.shares and rows > 1 else None,
+        )  # fmt: skip
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Memory, key: jax.Array
@@ -97,15 +109,24 @@ class LimSimTM:
         d, goal = state.d[slot], state.goal[slot]
 
         wall = decision.obstacles.gap[:, -1] - state.driver.s0
-        prediction = self.predict(lane_map, state, self.lattice.times(), stop=wall)
+        now = config.time(state.step)
+
+        def predict(times: Array) -> Prediction:
+            known = None
+            if memory.plan is not None:
+                known = shared(lane_map, state, memory.slot, memory.plan, now, times)
+            return self.predict(lane_map, state, times, stop=wall, plans=known)
+
+        prediction = predict(self.lattice.times())
         own = way_ahead(lane_map, lane, s, goal, points=_POINTS, step=_STEP)
         nearby = around(state, prediction, own, slot, self.nearest)
 
         told, since = memory.told, jnp.where(same, memory.since, -1e3)
-        now = config.time(state.step)
         if self.search is not None:
             due = (state.step // config.decision_every) % self.search_every == 0
-            told = self._search(lane_map, state, drives, lane, side, wish, own, nearby, wall, told, due, key)
+            told = self._search(
+                lane_map, state, drives, lane, side, wish, own, nearby, wall, predict, told, due, key
+            )
             since = jnp.where(due, now, since)
             wish = jnp.where(now - since < 1e2, told.side, wish)
 
@@ -151,13 +172,15 @@ class LimSimTM:
         chosen = plan(self.lattice, self.traffic.model, task)
         trajectory = Trajectory(
             x=chosen.x, y=chosen.y, heading=chosen.heading, v=chosen.v,
-            t0=config.time(state.step), dt=self.lattice.dt,
+            t0=now, dt=self.lattice.dt,
         )  # fmt: skip
-        return Command(trajectory=trajectory, signal=side), Memory(slot, side, told, since)
+        memory = Memory(slot, side, told, since, None if memory.plan is None else trajectory)
+        return Command(trajectory=trajectory, signal=side), memory
 
     def _search(
         self, lane_map: LaneMap, state: State, drives: Array, lane: Array, side: Array, wish: Array, own: Way,
-        nearby: Around, wall: Array, told: Told, due: Array, key: jax.Array,
+        nearby: Around, wall: Array, predict: Callable[[Array], Prediction], told: Told, due: Array,
+        key: jax.Array,
     ) -> Told:  # fmt: skip
         """What the search tells all planned vehicles, if it is `due`; else what it told them before.
 
@@ -169,7 +192,7 @@ class LimSimTM:
 
         def look(carry: tuple[Array, Told]) -> tuple[Array, Told]:
             times = settings.dt * jnp.arange(settings.steps + 1, dtype=jnp.float32)
-            prediction = self.predict(lane_map, state, times, stop=wall)
+            prediction = predict(times)
             counts = neighbours(nearby.gap, nearby.d, nearby.there)
             members = grouped(
                 lane_map, state, slot, drives, lane, jnp.where(side != 0, side, wish),
@@ -289,4 +312,5 @@ class LimSimTM:
 _POINTS, _STEP = 80, 2.0  # of a way, m
 _BEFORE_JUNCTION = 30.0  # m
 _ANY_SPEED = 1e3  # m/s, where nobody has searched yet
+_FAR = 1e9  # m, where there is no plan yet
 _HARD = 4.0  # m/s^2, the hardest braking that a lane change may ask of anybody; then it is given up
