@@ -122,6 +122,18 @@ def test_idm_as_a_loop_has_it(strict):
     assert (gaps > 1).all() and gaps[0] > gaps[4], "nobody runs into the first one; the slow keep back"
 
 
+def test_who_is_too_near_brakes_hard():
+    me, road = body((1.5, 1.5), d=(0.0, 0.0)), straight_road(wall=95.0)
+    rear = float(me.front[0]) + 1.0  # 1 m ahead stands somebody
+    seen = others([rear + 2.25], [0.0], [0.0])
+    way = []
+    for strict in (False, True):
+        found = pdm.idm(road, me, pdm._along(road, me, seen, pdm.STEPS), strict)
+        way.append(np.asarray(found.s)[0, :, -1].max())
+    # with 6 m/s^2, in steps of 0.1 s: 0.15 + 0.09 + 0.03 m
+    assert way[0] == pytest.approx(0.27, abs=0.01) and way[1] > 0.4, way
+
+
 def test_lqr_as_nuplan_writes_it():
     rng = np.random.default_rng(0)
     v, v_ahead = rng.uniform(0.5, 20, 7), rng.uniform(0, 20, 7)
@@ -151,13 +163,13 @@ def test_lqr_as_nuplan_writes_it():
 
 
 def arc(v, radius, steps=81):
-    """A circle driven at one speed by both vehicles; P equal proposals."""
-    t = 0.1 * np.arange(steps)
-    angle = v * t / radius
+    """A circle driven by both vehicles at one speed, or at those of the steps; P equal proposals."""
+    v = np.broadcast_to(np.asarray(v, float), steps)
+    angle = np.concatenate([[0.0], np.cumsum(0.1 * v[:-1])]) / radius
     row = lambda values: jnp.asarray(np.broadcast_to(values, (2, P, steps)), jnp.float32)  # noqa: E731
     return pdm.Reference(
         x=row(radius * np.sin(angle)), y=row(radius * (1 - np.cos(angle))), heading=row(angle),
-        v=row(np.full(steps, v)), curvature=row(np.full(steps, 1 / radius)),
+        v=row(v), curvature=row(np.full(steps, 1 / radius)),
     )  # fmt: skip
 
 
@@ -171,6 +183,18 @@ def test_the_tracker_stays_on_a_circle():
     np.testing.assert_allclose(motion.v, 8.0, atol=1e-3)
     ackermann = np.arctan(np.asarray(me.wheelbase) / 30.0)
     np.testing.assert_allclose(motion.steering[..., -1], np.repeat(ackermann[:, None], P, 1), rtol=0.05)
+
+
+def test_who_brakes_late_keeps_to_the_bend():
+    """The tracker brakes later than its reference: it is ahead of it, round the bend."""
+    me = body((8.0, 8.0), d=(0.0, 0.0))
+    me = me._replace(steering=jnp.arctan(me.wheelbase / 15.0))
+    late = arc(np.maximum(8.0 - 3.0 * 0.1 * np.arange(81), 3.0), 15.0)
+    off = []
+    for strict in (False, True):
+        motion = pdm.drive_along(late, me, 80, strict)
+        off.append(np.abs(np.hypot(motion.x, np.asarray(motion.y) - 15.0) - 15.0)[0, 0].max())
+    assert off[0] < 0.04 and off[1] > 0.5, off
 
 
 def test_the_bicycle_drives_a_circle():
