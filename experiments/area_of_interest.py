@@ -17,7 +17,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from readme_tables import OUTCOMES, area_of_interest
+from readme_tables import OUTCOMES, PAPER, area_of_interest
 from scipy.stats import wasserstein_distance
 
 from limsim_jax.bench import _processor
@@ -60,7 +60,7 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=24)
-    parser.add_argument("--scenario", default="roundabout")
+    parser.add_argument("--scenario", default="roundabout", choices=list(PAPER))
     options = parser.parse_args()
     use_all_cores()
     enable_compilation_cache()

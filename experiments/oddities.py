@@ -138,6 +138,9 @@ def main() -> None:
     options = parser.parse_args()
     if options.worlds < 1:
         parser.error(f"--worlds {options.worlds}: at least 1")
+    for name in options.map:
+        if not Path(name).exists() and name not in bundled_maps():
+            parser.error(f"--map {name}: no such file, nor one of {', '.join(bundled_maps())}")
     enable_compilation_cache()
     file = RESULTS / "oddities.json"
     rows = {row["map"]: row for row in json.loads(file.read_text())["maps"]} if file.exists() else {}

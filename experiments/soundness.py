@@ -172,6 +172,9 @@ def main() -> None:
     parser.add_argument("--rate", type=float)
     parser.add_argument("--out", default="soundness")
     options = parser.parse_args()
+    for name in options.map:
+        if not Path(name).exists() and name not in bundled_maps():
+            parser.error(f"--map {name}: no such file, nor one of {', '.join(bundled_maps())}")
     use_all_cores()
     file = RESULTS / f"{options.out}.json"
     rows = {row["map"]: row for row in json.loads(file.read_text())["maps"]} if file.exists() else {}
