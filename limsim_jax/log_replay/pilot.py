@@ -116,7 +116,8 @@ class PolicyPilot:
         then = time + dt + _GRID * jnp.arange(1, PLANNED + 1, dtype=time.dtype)
         plan = _straight(place, moved.v[0])
         if command.trajectory is not None:
-            plan = jnp.where(knows, command.trajectory.at(then)[0, :, :3], plan)
+            ahead: Array = command.trajectory.at(then)[0, :, :3]
+            plan = jnp.where(knows, ahead, plan)
         return Flight(
             flying=flying, x=place[0], y=place[1], heading=place[2], v=moved.v[0], a=moved.a[0], plan=plan,
             memory=_Memory(moved, command, policy),
