@@ -83,6 +83,11 @@ def test_places_are_kept_for_a_while_and_given_up_far_away():
     np.testing.assert_array_equal(first.slot, young.slot)
     old = chosen(narrow, state, first, 14.0)
     assert (old.slot == -1).all() and int(old.switches) == 2 * int(first.switches)
+    # between two lanes nobody is left alone: the traffic would see him on one of them only
+    a, b = (int(k) for k in first.slot[:2])
+    between = dataclasses.replace(state, d=state.d.at[a].set(-1.5), side=state.side.at[b].set(1))
+    np.testing.assert_array_equal(chosen(narrow, between, first, 14.0).slot[:2], [a, b])
+    assert (chosen(narrow, between, first, 14.0).slot[2:] == -1).all()
     # another vehicle in the same slot does not inherit the place
     late = dataclasses.replace(state, entered=state.entered + 5.0)
     assert not np.isin(

@@ -23,6 +23,8 @@ from limsim_jax.traffic.engine import Command
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, State, Status
 
+_ASIDE = 0.6  # m off the middle of its lane, from which a vehicle is on its way to or from another one
+
 
 class Places(NamedTuple):
     """Memory of the area: `K` places, and the memories of the policies."""
@@ -44,7 +46,7 @@ class AreaOfInterest:
       slots: vehicles beside the egos that can be planned for at a time.
       radius: m from the nearest ego, within which a vehicle gets a place.
       leave: m, beyond which it gives it up.
-      dwell: s that it keeps a place at least.
+      dwell: s that it keeps a place at least; and as long as it is between two lanes.
       options: arguments of `around` if that is a name.
     """
 
@@ -152,15 +154,17 @@ class AreaOfInterest:
         stays = (has & same[None]).any(-1)
         young = (has & (same & (now - memory.since < self.dwell))[None]).any(-1)
 
-        # who is about to reach its goal leaves by itself; half a lane change is ended by who began it
+        # half a lane change is ended by who began it; who is about to reach its goal leaves by itself
+        midway = stays & ((state.side != 0) | (jnp.abs(state.d) > _ASIDE))
         last = lane_map.routes.is_goal[state.lane, state.goal]
         leaving = last & (lane_map.length[state.lane] - state.s < 3.0 * state.v + 10.0)
-        fit = state.active & ~is_ego & ~leaving & ((state.status & int(Status.COLLIDED)) == 0)
+        fit = state.active & ~is_ego & (~leaving | midway) & ((state.status & int(Status.COLLIDED)) == 0)
         fit &= ~(has & ~same[None]).any(-1)  # a slot whose vehicle has changed is free for one decision
         fit &= stays | ((state.side == 0) & (state.s > state.shape.length))
         leave = 1.3 * self.radius if self.leave is None else self.leave
-        near = (away < self.radius) | (stays & (away < leave)) | young
-        relevance = jnp.exp(-away / 30.0) + jnp.where(stays, 0.5, 0.0) + jnp.where(young, 10.0, 0.0)
+        bound = young | midway
+        near = (away < self.radius) | (stays & (away < leave)) | bound
+        relevance = jnp.exp(-away / 30.0) + jnp.where(stays, 0.5, 0.0) + jnp.where(bound, 10.0, 0.0)
         relevance = jnp.where(fit & near, relevance, -1.0)
         best, who = lax.top_k(relevance, min(self.slots, number))
         chosen = ((jnp.arange(number)[:, None] == who[None]) & (best > 0)[None]).any(-1)
