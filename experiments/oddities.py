@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from soundness import HORIZON, INITIAL, OTHER_RATE, RATES, RESULTS, SLOTS
+from soundness import HORIZON, INITIAL, OTHER_RATE, RATES, RESULTS, SLOTS, check_maps
 
 from limsim_jax.bench import build_traffic
 from limsim_jax.files import write_whole
@@ -138,9 +138,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.worlds < 1:
         parser.error(f"--worlds {options.worlds}: at least 1")
-    for name in options.map:
-        if not Path(name).exists() and name not in bundled_maps():
-            parser.error(f"--map {name}: no such file, nor one of {', '.join(bundled_maps())}")
+    check_maps(parser, options.map)
     enable_compilation_cache()
     file = RESULTS / "oddities.json"
     rows = {row["map"]: row for row in json.loads(file.read_text())["maps"]} if file.exists() else {}

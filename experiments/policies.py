@@ -95,6 +95,8 @@ def main() -> None:
     parser.add_argument("--skip", choices=("worlds", "decisions"))
     parser.add_argument("--out", type=Path, default=Path("results/policies"))
     options = parser.parse_args()
+    if options.seeds < 1:
+        parser.error(f"--seeds {options.seeds}: at least 1")
     use_all_cores()
     enable_compilation_cache()
     file = RESULTS / "policies.json"

@@ -159,6 +159,13 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def check_maps(parser: argparse.ArgumentParser, names: list[str]) -> None:
+    """Ends the program where one of them is neither a file nor a bundled map."""
+    for name in names:
+        if not Path(name).exists() and name not in bundled_maps():
+            parser.error(f"--map {name}: no such file, nor one of {', '.join(bundled_maps())}")
+
+
 def main() -> None:
     """Parse the command line, run, write."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -172,9 +179,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float)
     parser.add_argument("--out", default="soundness")
     options = parser.parse_args()
-    for name in options.map:
-        if not Path(name).exists() and name not in bundled_maps():
-            parser.error(f"--map {name}: no such file, nor one of {', '.join(bundled_maps())}")
+    check_maps(parser, options.map)
     use_all_cores()
     file = RESULTS / f"{options.out}.json"
     rows = {row["map"]: row for row in json.loads(file.read_text())["maps"]} if file.exists() else {}

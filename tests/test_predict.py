@@ -143,9 +143,8 @@ def test_what_is_shared_goes_on_from_where_the_vehicle_is():
     found, free = predict(lane_map, state, TIMES, plans=plans), predict(lane_map, state, TIMES)
     for k, row in enumerate((3, 5)):
         ahead = arc(row, np.asarray(TIMES), 0.0)
-        over = (
-            v * 0.5 * np.stack([np.cos(ahead[2, 7]), np.sin(ahead[2, 7])])
-        )  # its last half second: straight on
+        # beyond the end of the plan, half a second straight on
+        over = v * 0.5 * np.stack([np.cos(ahead[2, 7]), np.sin(ahead[2, 7])])
         ahead[:2, 8], ahead[2, 8] = ahead[:2, 7] + over, ahead[2, 7]
         np.testing.assert_allclose(found.x[row], ahead[0], atol=2e-3, err_msg=str(k))
         np.testing.assert_allclose(found.y[row], ahead[1], atol=2e-3)

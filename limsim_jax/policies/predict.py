@@ -31,7 +31,7 @@ STOPPING = 2.0
 """m/s^2, braking before a place to stop, or what it takes if that is more."""
 
 _LANES = 4  # lanes beyond the own one that are looked at
-_STRAYED = 2.0  # m
+_STRAYED = 2.0  # m, along x or y
 
 
 @struct.dataclass(frozen=True, kw_only=True)
