@@ -260,13 +260,16 @@ def test_braking_for_a_leader_that_brakes_on(a_lead):
 
 
 def test_urgency_grows_towards_the_last_place_and_with_the_lanes_to_cross():
-    room = jnp.asarray([1e9, 300.0, 120.0, 40.0, 0.0], jnp.float32)
+    room = jnp.asarray([1e9, 450.0, 290.0, 220.0, 0.0], jnp.float32)
     v, time = jnp.full(5, 20.0), jnp.full(5, 4.5)
     one = np.asarray(urgency(jnp.full(5, -1), room, v, time))
     two = np.asarray(urgency(jnp.full(5, 2), room, v, time))
-    assert one[0] == 0 and one[-1] == 1 and (np.diff(one) >= 0).all()
-    assert (two >= one).all() and two[1] > one[1] - 1e-6 and two[2] > one[2]
+    # way of a change v T + 12, and before the end the distance to stop from v with 1 m/s^2, per lane
+    np.testing.assert_allclose(one, [0, 0, (302 - 290) / 102, (302 - 220) / 102, 1], rtol=1e-5)
+    np.testing.assert_allclose(two, [0, (604 - 450) / 204, 1, 1, 1], rtol=1e-5)
     assert not np.asarray(urgency(jnp.zeros(5, int), room, v, time)).any()
+    slow = urgency(jnp.full(1, 2), jnp.full(1, 90.0), jnp.full(1, 5.0), time[:1])  # 40 m before the end
+    np.testing.assert_allclose(slow, (2 * 34.5 + 40 - 90) / 69, rtol=1e-5)
 
 
 def test_lateral_motion_is_the_quintic():
@@ -314,6 +317,27 @@ def test_two_abreast_swap_lanes(lead):
     assert float(trace["apart"].min()) > 0 and float(trace["a"].min()) > -3.5
     standing = (np.asarray(trace["v"]) < 0.1) & (np.asarray(trace["lane"]) == np.asarray(lane))
     assert standing.sum(0).max() < 100  # of 600 steps of 0.1 s: no patience is tried
+
+
+@pytest.mark.parametrize("v_lead", [10.0, 20.0])
+def test_who_has_to_get_onto_the_next_lane_takes_its_pace(v_lead):
+    """On an acceleration lane, abreast of a leader that is too near to cut in behind."""
+    network, lane_map = bundled("ramp")
+    rows = lane_rows(network)
+    merging, beside = rows["2_0_-5"], rows["2_0_-4"]
+    goal = int(np.argmax(np.asarray(lane_map.routes.lanes_to_go)[merging] == 1))
+    free = state_of("ramp", [merging], [60.0], [22.0], [goal])
+    s = 60.0 + 1.0 + float(free.shape.length[0])  # its rear is 1 m ahead
+    _, alone = runner("ramp", Traffic(), 2)(free)
+    end, trace = runner("ramp", Traffic(), 120)(
+        state_of("ramp", [merging, beside], [60.0, s], [22.0, v_lead], [goal] * 2)
+    )
+    assert float(alone["a"][0, 0]) > -0.5
+    a = np.asarray(trace["a"])[:, 0]
+    assert a[0] < -1.5 if v_lead < 22 - 5 else a[0] < float(alone["a"][0, 0]) - 0.3
+    assert a.min() > -2.5, "and brakes for that as for courtesy, not harder"
+    assert int(end.lane[0]) != merging and not int(end.status[0])
+    assert float(trace["v"][:, 0].min()) > 5, "in motion"
 
 
 def test_who_waits_before_a_wrong_lane_too_short_to_wait_on_takes_another_goal():

@@ -6,18 +6,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from synthetic import network, straight
 from traffic_worlds import bundled, scattered, shapes, state_of
 
-from limsim_jax.maps.lane_map import NO_LANE
+from limsim_jax.maps.lane_map import NO_LANE, build_lane_map, lane_rows
 from limsim_jax.traffic.car_following import NO_GAP
-from limsim_jax.traffic.neighbors import neighbors, other_lane, place_of, sort_vehicles
+from limsim_jax.traffic.neighbors import (
+    lanes_ahead,
+    look_ahead,
+    neighbors,
+    other_lane,
+    place_of,
+    sort_vehicles,
+)
 from limsim_jax.types import Config
 
 CONFIG = Config(dt=0.1)
 
 
-def by_loop(lane_map, state, shape, lane, s, config=CONFIG):
-    """Leader and follower of each vehicle at (lane, s): every pair is looked at."""
+def by_loop(lane_map, state, shape, lane, s, config=CONFIG, *, far=False):
+    """Leader and follower of each vehicle at (lane, s): every pair is looked at.
+
+    `far`: followers may also come over more than one lane.
+    """
     length = np.asarray(lane_map.length)
     after = np.asarray(lane_map.successors)
     next_lane, before = np.asarray(lane_map.routes.next_lane), np.asarray(lane_map.predecessors)
@@ -54,6 +65,18 @@ def by_loop(lane_map, state, shape, lane, s, config=CONFIG):
                     queue = [(at, j) for j, on, at in entries if on == b and b != NO_LANE]
                     if queue and max(queue)[1] != i:
                         found.append((s[i] + length[b] - max(queue)[0], max(queue)[1]))
+                queue = []
+                for j in np.nonzero(np.asarray(state.active))[0] if far else ():
+                    here, way = int(state.lane[j]), -float(state.s[j])
+                    for depth in range(lanes_ahead(config, lane_map) + 1):
+                        if depth > 1 and here == lane[i] and way < config.look_ahead:
+                            queue.append((way, j))
+                        if here == NO_LANE:
+                            break
+                        way += length[here]
+                        here = int(next_lane[here, int(state.goal[j])])
+                if queue and min(queue)[1] != i:
+                    found.append((s[i] + min(queue)[0], min(queue)[1]))
             if found:
                 distance, lag = min(found)
                 lag_gap = distance - float(shape.length[i])
@@ -64,8 +87,8 @@ def by_loop(lane_map, state, shape, lane, s, config=CONFIG):
 @pytest.mark.parametrize(
     ("name", "n"), [("highway", 60), ("ramp", 80), ("roundabout", 40), ("intersection", 60)]
 )
-@pytest.mark.parametrize("seed", [0, 1])
-def test_neighbors_are_those_of_the_loop(name, n, seed):
+@pytest.mark.parametrize(("seed", "far"), [(0, True), (1, False)])
+def test_neighbors_are_those_of_the_loop(name, n, seed, far):
     _, lane_map = bundled(name)
     state = scattered(name, n, seed)
     rng = np.random.default_rng(seed)
@@ -87,18 +110,42 @@ def test_neighbors_are_those_of_the_loop(name, n, seed):
     def query(state, lane, s):
         order = sort_vehicles(lane_map, state)
         here = place_of(order, lane_map, lane, s)
-        return neighbors(CONFIG, lane_map, order, state, lane, s, here)
+        ahead = look_ahead(CONFIG, lane_map, state) if far else None
+        return neighbors(CONFIG, lane_map, order, state, lane, s, here, ahead)
 
     pair = query(state, jnp.asarray(lane), jnp.asarray(s))
     found_any = 0
     for k in range(2):
-        lead, lead_gap, lag, lag_gap = by_loop(lane_map, state, shape, lane[:, k], np.asarray(s[:, k]))
+        lead, lead_gap, lag, lag_gap = by_loop(
+            lane_map, state, shape, lane[:, k], np.asarray(s[:, k]), far=far
+        )
         np.testing.assert_array_equal(np.asarray(pair.lead[:, k]), lead)
         np.testing.assert_allclose(np.asarray(pair.lead_gap[:, k]), lead_gap, atol=5e-3)
         np.testing.assert_array_equal(np.asarray(pair.lag[:, k]), lag)
         np.testing.assert_allclose(np.asarray(pair.lag_gap[:, k]), lag_gap, atol=5e-3)
         found_any += (lead >= 0).sum() + (lag >= 0).sum()
     assert found_any > n  # the comparison is about something
+
+
+def test_a_follower_two_lanes_back_is_seen():
+    """Who comes to a lane over a short one, as lanes of SUMO's junctions are; who turns off does not count."""
+    map_ = network([
+        straight("a", (0.0, 0.0), 0.0, 200.0, successors=("b", "off")),
+        straight("b", (200.0, 0.0), 0.0, 4.0, successors=("c",)),
+        straight("off", (200.0, 0.0), -0.3, 4.0),
+        straight("c", (204.0, 0.0), 0.0, 100.0),
+    ])  # fmt: skip
+    rows, lane_map = lane_rows(map_), build_lane_map(map_, goals=[["c"], ["off"]])
+    lane, s = [rows["c"], rows["a"], rows["a"]], [30.0, 150.0, 170.0]
+    state = state_of("ramp", lane, s, [10.0] * 3, [0, 0, 1])
+    order = sort_vehicles(lane_map, state)
+    here = order.rank[:3] + 1
+    query = state.lane[:, None], state.s[:, None], here[:, None]
+    pair = neighbors(CONFIG, lane_map, order, state, *query, look_ahead(CONFIG, lane_map, state))
+    length = float(state.shape.length[0])
+    assert int(pair.lag[0, 0]) == 1
+    np.testing.assert_allclose(float(pair.lag_gap[0, 0]), 30 + 4 + 50 - length, atol=1e-2)
+    assert int(neighbors(CONFIG, lane_map, order, state, *query).lag[0, 0]) == -1, "without their ways"
 
 
 def test_nobody_sees_empty_slots_or_itself():

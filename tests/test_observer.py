@@ -189,7 +189,7 @@ def random_tick(rng, slot: int, lane: int | None = None) -> Tick:
     decision = Decision(
         obstacles=Obstacles(i32(other), f32(gap)),
         v0=f32(rng.uniform(3, 20, N)), v_ahead=f32(rng.uniform(3, 20, N)), ahead=f32(rng.uniform(0, 99, N)),
-        courtesy=i32(np.full(N, -1)), courtesy_gap=f32(np.zeros(N)),
+        courtesy=Obstacles(i32(np.full((N, 2), -1)), f32(np.full((N, 2), NO_GAP))),
         way=i32(way),
     )  # fmt: skip
     return Tick(

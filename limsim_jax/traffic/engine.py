@@ -64,7 +64,7 @@ AT_END = 40.0
 """m from the end of a lane within which that counts."""
 
 _BEND_POINTS = 4  # places ahead on the own lane at which the bend is looked at
-_GENTLY = 2.5  # m/s^2
+_GENTLY, _FIRMLY = 2.5, 3.0  # m/s^2
 _IN_TIME = 0.9  # of the speed that would just do, as drivers come down to it by and by
 _WALL = 1.0  # m before the end of a lane that leads nowhere
 _WALL_ROOM = 25.0  # m before it, kept free to change lanes from a standstill
@@ -133,6 +133,7 @@ def decide(
         jnp.stack([jnp.where(state.active, state.lane, NO_LANE), other, beside], -1),
         jnp.stack([state.s, other_s, beside_s], -1),
         jnp.stack([order.rank[:n] + 1, order.rank[n:] + 1, place_of(order, lane_map, beside, beside_s)], -1),
+        ahead,
     )
     found = computed_once(found)
     own, second, new = (jax.tree.map(lambda x: x[:, k], found) for k in range(3))  # noqa: B023
@@ -169,8 +170,7 @@ def decide(
         v0=v0,
         v_ahead=v_ahead,
         ahead=distance,
-        courtesy=choice.letting,
-        courtesy_gap=choice.letting_gap,
+        courtesy=choice.courtesy,
         way=ahead.lane,
     )
 
@@ -228,7 +228,10 @@ def _behind_tails(lane_map: LaneMap, state: State, ahead: Ahead, own: Pair) -> P
 def _stay(state: State) -> LaneChoice:
     stay = jnp.zeros_like(state.side)
     none = jnp.zeros_like(state.v)
-    return LaneChoice(side=stay, letting=stay - 1, letting_gap=none, stops_before=none)
+    nobody = jnp.stack([stay - 1] * 2, -1)
+    return LaneChoice(
+        side=stay, courtesy=Obstacles(nobody, jnp.full(nobody.shape, NO_GAP)), stops_before=none
+    )
 
 
 def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N"]:
@@ -237,7 +240,7 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
     at_goal = lane_map.routes.is_goal[ahead.lane, goal]
     stuck = (lane_map.routes.next_lane[ahead.lane, goal] == NO_LANE) & ~at_goal & (ahead.lane != NO_LANE)
     # who is on its way out may use the taper; others keep room to start from a standstill
-    stopping = (state.v * state.v / (2 * state.driver.b))[:, None]
+    stopping = (state.v * state.v / (2 * _FIRMLY))[:, None]
     end = ahead.start + lane_map.length[ahead.lane] - _WALL
     wide = ahead.start + lane_map.end_s[ahead.lane] - _WALL
     # and where the lane is too short for that, nobody waits before it, on a lane that it would block

@@ -17,7 +17,7 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap, room_beside, side_s, widt
 from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
 from limsim_jax.traffic.motion import CREEP_SPEED
-from limsim_jax.traffic.neighbors import Pair
+from limsim_jax.traffic.neighbors import Obstacles, Pair
 from limsim_jax.types import State
 
 ROUTE_BASE, ROUTE_URGENT = 0.5, 4.0
@@ -26,11 +26,12 @@ ROUTE_BASE, ROUTE_URGENT = 0.5, 4.0
 SAFE_URGENT = 3.0
 """m/s^2, added to `b_safe` at full urgency."""
 
-CAUTION = 40.0
-"""m before the last place to change by which a driver wants to be done."""
+CAUTION, EASE_OFF = 40.0, 1.0
+"""A driver wants to be done so many m before the last place to change, or for every lane to cross so far
+before it that slowing down with so many m/s^2 would do: who brakes for the end no longer fits into a gap."""
 
-COURTEOUS = 0.6
-"""Urgency from which the follower on the other lane lets a vehicle in."""
+COURTEOUS = 0.15
+"""Urgency from which a vehicle takes the pace of the other lane, and the follower there lets it in."""
 
 INTENT = 0.3
 """Urgency from which a driver looks only where the route goes, and minds who needs the own lane."""
@@ -61,8 +62,7 @@ class LaneChoice(NamedTuple):
     """What a vehicle would do about its lane, from the present state alone."""
 
     side: Int[Array, " N"]  # +1 left, -1 right, 0 stay
-    letting: Int[Array, " N"]  # slot of the vehicle that each one should let in, -1 for none
-    letting_gap: Float[Array, " N"]  # m to it
+    courtesy: Obstacles  # whom each one lets in, and who is ahead on the lane that it has to get to
     stops_before: Float[Array, " N"]  # m before the end of a wrong lane, to let another one out of its lane
 
 
@@ -75,7 +75,8 @@ def urgency(
     """How pressing a change of lanes for the route is, 0 to 1, `room` m before the last place for it."""
     count = jnp.abs(lanes_to_go).astype(v.dtype)
     way = count * (v * lane_change_time + 12.0)
-    pressing = jnp.clip((way + CAUTION - room) / jnp.maximum(way, 1.0), 0, 1)
+    spare = jnp.maximum(CAUTION, count * v * v / (2 * EASE_OFF))
+    pressing = jnp.clip((way + spare - room) / jnp.maximum(way, 1.0), 0, 1)
     return jnp.where(lanes_to_go != 0, pressing, 0)
 
 
@@ -230,12 +231,16 @@ def choose_lane(
     rested = (state.rest <= 0) | (press > 0)
     starts = allowed & reachable & safe & ~late & rested & (advantage > driver.threshold) & (side == turn)
 
-    asks = towards & (press > COURTEOUS) & allowed & follower & ~starts
+    asks = towards & (press > COURTEOUS) & allowed & ~starts
     starts, asks = computed_once((starts, asks))
+
+    # who is in need takes the pace of the lane that it has to get to, and falls behind who is abreast
+    matching = jnp.where(asks, pair.lead, -1)
+    matching_gap = jnp.where(asks, pair.lead_gap, NO_GAP)
 
     # courtesy: the vehicle that would be the new follower of somebody in need lets it in
     n = me.shape[0]
-    letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(asks, pair.lag, n)].max(me)[:n]
+    letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(asks & follower, pair.lag, n)].max(me)[:n]
     letting_gap = jnp.where(letting >= 0, pair.lag_gap[letting], NO_GAP)
     letting = jnp.where(letting_gap > 0, letting, -1)
 
@@ -250,8 +255,7 @@ def choose_lane(
     swaps &= (wanted[abreast] == -wanted) & (press[abreast] > 0)
     return LaneChoice(
         side=jnp.where(starts, side, 0),
-        letting=letting,
-        letting_gap=letting_gap,
+        courtesy=Obstacles(jnp.stack([letting, matching], -1), jnp.stack([letting_gap, matching_gap], -1)),
         stops_before=jnp.where(swaps, shape.length[abreast] + BEHIND, 0),
     )
 

@@ -43,13 +43,12 @@ class Decision(NamedTuple):
     v0: Float[Array, " N"]  # m/s, desired speed here
     v_ahead: Float[Array, " N"]  # m/s, lower speed needed further on
     ahead: Float[Array, " N"]  # m to there, at the decision
-    courtesy: Int[Array, " N"]  # slot of a vehicle that is let in, -1 for none
-    courtesy_gap: Float[Array, " N"]  # m to it, at the decision
+    courtesy: Obstacles  # who is let in, and behind whom a place is looked for
     way: Int[Array, "N D"]  # lane and the lanes that it will drive on next
 
 
 COURTESY = 2.0
-"""m/s^2, the hardest braking to let somebody in."""
+"""m/s^2, the hardest braking to let somebody in, or to find a place on the next lane."""
 
 
 @jax.named_scope("accelerations")
@@ -83,10 +82,11 @@ def accelerations(
     need = state.v * state.v / (2 * jnp.maximum(line, 0.02))
     rolls = (state.v < WALKING_SPEED) & (line < 1.0) & (need > 0.5)
     a = jnp.where(rolls, jnp.minimum(a, -jnp.minimum(need, _HALT)), a)
-    polite = (decision.courtesy >= 0) & state.active[decision.courtesy]
-    gap = jnp.where(polite, decision.courtesy_gap + seen(decision.courtesy, x) - x, NO_GAP)
-    v_lead = jnp.where(polite, seen(decision.courtesy, state.v), state.v)
-    kind = model(driver, gap=gap, v=state.v, v_lead=v_lead, a_lead=jnp.zeros_like(a), v0=v0)
+    index, gap0 = (x.T for x in decision.courtesy)
+    minds = (index >= 0) & state.active[index]
+    gap = jnp.where(minds, gap0 + seen(index, x) - x[None], NO_GAP)
+    v_lead = jnp.where(minds, seen(index, state.v), state.v[None])
+    kind = model(each, gap=gap, v=v, v_lead=v_lead, a_lead=jnp.zeros_like(gap), v0=v_free).min(0)
     return jnp.minimum(a, jnp.maximum(kind, -COURTESY))
 
 

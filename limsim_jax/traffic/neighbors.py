@@ -107,6 +107,28 @@ class Shelf:
         return jnp.searchsorted(keys, last, side="right", method="scan_unrolled").astype(jnp.int32)
 
 
+def _coming(
+    config: Config, lane_map: LaneMap, state: State, ahead: Ahead
+) -> tuple[Int[Array, " L"], Float[Array, " L"]]:
+    """The next vehicle that comes to each lane over at least one other lane, and m from it to the lane.
+
+    -1 where nobody comes within `config.look_ahead`.
+    """
+    size, n = lane_map.length.shape[0], state.lane.shape[0]
+    # one word that holds distance and slot, so that one scatter finds both
+    slot_bits = max(1, (n - 1).bit_length())
+    most = 2 ** min(22, 31 - slot_bits)
+    lane, start = ahead.lane[:, 2:], ahead.start[:, 2:]
+    seen = state.active[:, None] & (lane != NO_LANE) & (start < config.look_ahead)
+    share = jnp.clip(start / config.look_ahead, 0, 1)
+    word = (share * most).astype(jnp.uint32) << slot_bits
+    word |= jnp.arange(n, dtype=jnp.uint32)[:, None]
+    nobody = jnp.uint32(2**32 - 1)
+    first = jnp.full(size, nobody).at[jnp.where(seen, lane, size)].min(word, mode="drop")
+    slot = jnp.where(first == nobody, -1, (first & (2**slot_bits - 1)).astype(jnp.int32))
+    return slot, (first >> slot_bits).astype(jnp.float32) * (config.look_ahead / most)
+
+
 def lanes_ahead(config: Config, lane_map: LaneMap) -> int:
     """How many lanes beyond the own one everybody looks at: more on maps of short lanes."""
     return max(config.look_ahead_lanes, lane_map.lanes_in_sight)
@@ -189,6 +211,7 @@ def neighbors(
     lane: Int[Array, "N K"],
     s: Float[Array, "N K"],
     here: Int[Array, "N K"],
+    ahead: Ahead | None = None,
 ) -> Pair:
     """Leaders and followers of every vehicle as if it stood at `s` (m) of `lane`, for K places each.
 
@@ -196,8 +219,8 @@ def neighbors(
     `rank` + 1.
 
     The leader is looked for along the route from there, within `config.look_ahead`; the follower on the
-    lane, else on the last stretch of two of its predecessors. The vehicle itself does not count.
-    Without a lane there is nobody.
+    lane, else it is the nearest of the first on each of two predecessors and, given the ways `ahead` of all,
+    of those who come from farther back. The vehicle itself does not count. Without a lane there is nobody.
     """
     # vehicles last: their axis is the long one, along which XLA vectorises
     lane, s, here = lane.T, s.T, here.T
@@ -214,17 +237,17 @@ def neighbors(
         lanes.append(after)
         starts.append(start)
         start = start + lane_map.length[after]
-    ahead, offset = jnp.stack(lanes), jnp.stack(starts)  # [D, K, N]
+    on, offset = jnp.stack(lanes), jnp.stack(starts)  # [D, K, N]
     behind = jnp.stack([lane_map.predecessors[lane, k] for k in range(_UPSTREAM)])  # [P, K, N]
-    first, last = order.first[ahead], order.last[behind]
+    first, last = order.first[on], order.last[behind]
 
     # leader: the next entry that is not oneself, else the last vehicle of the lanes that follow
     vehicle, position = _entry(order, here, lane)
     vehicle2, position2 = _entry(order, here + 1, lane)
     skip = vehicle == me
     lead, lead_at = jnp.where(skip, vehicle2, vehicle), jnp.where(skip, position2, position) - s
-    vehicle, position = _entry(order, first, ahead)
-    vehicle2, position2 = _entry(order, first + 1, ahead)
+    vehicle, position = _entry(order, first, on)
+    vehicle2, position2 = _entry(order, first + 1, on)
     skip = vehicle == me[None]
     vehicle, position = jnp.where(skip, vehicle2, vehicle), offset + jnp.where(skip, position2, position)
     vehicle, position = computed_once((vehicle, position))
@@ -249,6 +272,11 @@ def neighbors(
     for k in range(_UPSTREAM):
         nearer = upstream & ((distance[k] < lag_at) | (k == 0))
         lag, lag_at = jnp.where(nearer, vehicle[k], lag), jnp.where(nearer, distance[k], lag_at)
+    if ahead is not None:
+        vehicle, start = (x[lane] for x in _coming(config, lane_map, state, ahead))
+        distance = s + start
+        nearer = upstream & (vehicle >= 0) & (vehicle != me) & ((distance < lag_at) | (lag < 0))
+        lag, lag_at = jnp.where(nearer, vehicle, lag), jnp.where(nearer, distance, lag_at)
     found = Pair(
         lead,
         jnp.where(lead >= 0, lead_gap, NO_GAP),

@@ -1,0 +1,240 @@
+"""Who does not find a gap: an on-ramp with a short acceleration lane, and an exit, next to SUMO.
+
+    python experiments/merge.py [--worlds 64] [--length 200] [--ramp 1200]
+
+Three lanes of a motorway with 120 km/h, and vehicles that have to get onto them, or off, within `--length` m:
+`on` from a ramp at 80 km/h over an acceleration lane, `off` over a deceleration lane to such a ramp. The flow
+on the motorway grows from row to row. Both simulators read the same network, with the same flows and their
+own default drivers. Counted are those who have to change lanes, and how many of them come to a stand before
+they have done so, or never do. Writes experiments/results/merge.json and .md. Needs `eclipse-sumo`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from limsim_jax.files import write_whole
+from limsim_jax.maps import build_lane_map, load_map
+from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.maps.routing import default_goals
+from limsim_jax.rollout import Rollout, Worlds, use_all_cores
+from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
+from limsim_jax.traffic.engine import Tick, Traffic
+from limsim_jax.traffic.vehicles import default_population, fitting
+from limsim_jax.types import Config, State, Status
+
+RESULTS = Path(__file__).parent / "results"
+MOTORWAY = (1200.0, 2400.0, 3600.0, 4800.0)  # veh/h on its three lanes
+HORIZON = 600.0  # s
+SLOTS = 256
+DT = 0.1  # s, of both
+STANDS = 0.1  # m/s, below which SUMO counts a vehicle as waiting
+FAST, SLOW = 33.33, 22.22  # m/s
+UPSTREAM, DOWNSTREAM, RAMP = 800.0, 600.0, 300.0  # m
+WIDTH = 3.2  # m, netconvert's lanes
+
+
+def network(case: str, length: float, folder: Path) -> Path:
+    """A motorway with a ramp, from SUMO's netconvert."""
+    from sumo import SUMO_HOME  # pyright: ignore[reportMissingImports]
+
+    on, edge = case == "on", -3 * WIDTH  # lanes lie to the right of their edge
+    course = [(-RAMP, edge - 0.1 * RAMP), (-RAMP / 3, edge), (0.0, edge)]
+    course = course if on else [(length - x, y) for x, y in reversed(course)]
+    points = {"west": (-UPSTREAM, 0), "a": (0, 0), "b": (length, 0), "east": (length + DOWNSTREAM, 0)}
+    points["far"] = course[0 if on else -1]
+    nodes = [f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in points.items()]
+    roads = {"before": ("west", "a", 3, FAST), "beside": ("a", "b", 4, FAST), "after": ("b", "east", 3, FAST)}
+    roads["ramp"] = ("far", "a", 1, SLOW) if on else ("b", "far", 1, SLOW)
+    shape = {"ramp": f'shape="{" ".join(f"{x},{y}" for x, y in course)}"'}
+    edges = [
+        f'<edge id="{name}" from="{a}" to="{b}" numLanes="{lanes}" speed="{speed}" {shape.get(name, "")}/>'
+        for name, (a, b, lanes, speed) in roads.items()
+    ]
+    links = [("before", k, "beside", k + 1) for k in range(3)] + [
+        ("beside", k + 1, "after", k) for k in range(3)
+    ]
+    links.append(("ramp", 0, "beside", 0) if on else ("beside", 0, "ramp", 0))
+    joints = [f'<connection from="{a}" fromLane="{k}" to="{b}" toLane="{j}"/>' for a, k, b, j in links]
+    for name, kind, lines in (
+        ("nod", "nodes", nodes),
+        ("edg", "edges", edges),
+        ("con", "connections", joints),
+    ):
+        (folder / f"{name}.xml").write_text(f"<{kind}>{''.join(lines)}</{kind}>")
+    net = folder / f"{case}.net.xml"
+    command = [Path(SUMO_HOME) / "bin" / "netconvert", "--no-turnarounds", "true", "-o", net]
+    command += ["-n", folder / "nod.xml", "-e", folder / "edg.xml", "-x", folder / "con.xml"]
+    subprocess.run([str(x) for x in command], check=True, capture_output=True)
+    return net
+
+
+def flows(case: str, motorway: float, ramp: float) -> list[tuple[str, str, float]]:
+    """Origin, goal, veh/h."""
+    if case == "on":
+        return [("before", "after", motorway), ("ramp", "after", ramp)]
+    return [("before", "after", motorway - ramp), ("before", "ramp", ramp)]
+
+
+class Changes:
+    """Who has to change lanes for its goal, who stood before that was done, who never did: a `Measure`."""
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """Nobody is there yet."""
+        nobody = jnp.zeros(state.active.shape, bool)
+        return state.entered, nobody, nobody, nobody, jnp.zeros(3, jnp.int32)
+
+    def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
+        """What counts of a step."""
+        state = tick.state
+        must = lane_map.routes.lanes_to_go[state.lane, state.goal] != 0
+        missed = (state.status & int(Status.MISSED_ROUTE)) != 0
+        must, missed = state.active & must, state.active & missed
+        return jnp.where(state.active, state.entered, -1), must, must & (state.v < STANDS), missed
+
+    def update(self, config: Config, lane_map: LaneMap, carry: Any, looks: Any) -> Any:
+        """Counts everybody once."""
+
+        def step(carry: Any, now: Any) -> tuple[Any, None]:
+            who, *known, counts = carry
+            same = who == now[0]
+            known = [same & x for x in known]
+            counts += jnp.stack(
+                [jnp.sum(x & ~y, dtype=jnp.int32) for x, y in zip(now[1:], known, strict=True)]
+            )
+            return (now[0], *(x | y for x, y in zip(now[1:], known, strict=True)), counts), None
+
+        return jax.lax.scan(step, carry, looks)[0]
+
+    def result(self, config: Config, lane_map: LaneMap, carry: Any) -> Any:
+        """How many."""
+        return carry[-1]
+
+
+def ours(net: Path, demand: list[tuple[str, str, float]], worlds: int) -> dict[str, Any]:
+    """Our traffic."""
+    found = load_map(net)
+    lane_map = build_lane_map(found)
+    wanted = [Flow(origin=a, goal=b, rate=rate) for a, b, rate in demand if rate > 0]
+    population = fitting(default_population(), lane_map)
+    goals = default_goals(found)
+    spec = build_demand(found, lane_map, goals, wanted, population, horizon=HORIZON, vehicles=0)
+    run = Rollout(Config(dt=DT), Traffic(), HORIZON, measure=Changes())
+    batch = Worlds(
+        run, lane_map, lambda key: sample_scenario(spec, lane_map, key, SLOTS), chunk=min(worlds, 32)
+    )
+    parts = [(x.totals, x.measures) for _, x in batch.chunks(range(worlds))]
+    totals, counts = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    must, stood, missed = (int(x) for x in counts.sum(0))
+    return {
+        "must_change": must,
+        "stood": stood,
+        "missed": missed,
+        "contacts": int(totals.collided.sum()),
+        "left_per_hour": float(totals.left.sum()) * 3600 / HORIZON / worlds,
+        "speed": float(totals.distance.sum() / totals.time.sum()),
+    }
+
+
+def theirs(net: Path, demand: list[tuple[str, str, float]], worlds: int) -> dict[str, Any]:
+    """SUMO's; who missed is whom it teleports from a wrong lane."""
+    import libsumo  # pyright: ignore[reportMissingImports]
+
+    lines = [
+        f'<flow id="{a}_{b}" begin="0" end="{HORIZON}" from="{a}" to="{b}" period="exp({rate / 3600})" '
+        f'departLane="best" departSpeed="max"/>'
+        for a, b, rate in demand if rate > 0
+    ]  # fmt: skip
+    routes = net.with_suffix(".rou.xml")
+    routes.write_text(f"<routes>{''.join(lines)}</routes>")
+    through = {f"{a}_{b}" for a, b, _ in demand if (a, b) == ("before", "after")}
+    must, stood, missed, contacts, left, metres, seconds = 0, 0, 0, 0, 0, 0.0, 0.0
+    for seed in range(worlds):
+        options = ["-n", str(net), "-r", str(routes), "--step-length", str(DT), "--seed", str(seed)]
+        libsumo.start(["sumo", *options, "--no-step-log", "--no-warnings", "--xml-validation", "never"])
+        come, stand, gone = set[str](), set[str](), set[str]()
+        for _ in range(round(HORIZON / DT)):
+            libsumo.simulationStep()
+            left += libsumo.simulation.getArrivedNumber()
+            contacts += libsumo.simulation.getCollidingVehiclesNumber()
+            gone |= set(libsumo.simulation.getStartingTeleportIDList())
+            for name in libsumo.vehicle.getIDList():
+                v = libsumo.vehicle.getSpeed(name)
+                metres, seconds = metres + v * DT, seconds + DT
+                if name.rsplit(".", 1)[0] in through:
+                    continue
+                lane = libsumo.vehicle.getLaneID(name)
+                off = name.startswith("before")  # to the exit
+                come |= {name} if not off or lane.startswith("before") else set()
+                waits = lane.startswith("beside") and (lane != "beside_0") == off
+                stand |= {name} if waits and v < STANDS else set()
+        libsumo.close()
+        must, stood, missed = must + len(come), stood + len(stand), missed + len(gone)
+    return {
+        "must_change": must,
+        "stood": stood,
+        "missed": missed,
+        "contacts": contacts,
+        "left_per_hour": left * 3600 / HORIZON / worlds,
+        "speed": metres / seconds,
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown."""
+    lines = [
+        "| ramp | motorway, veh/h | ramp, veh/h | simulator | have to change lanes | stood before, % "
+        "| missed, % | arrived, veh/h | mean speed, m/s | contacts |",
+        "|---|---:|---:|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        for name in ("ours", "SUMO"):
+            x = row[name]
+            stood, missed = (100 * x[key] / max(x["must_change"], 1) for key in ("stood", "missed"))
+            lines.append(
+                f"| {row['case']} | {row['motorway']:,.0f} | {row['ramp']:,.0f} | {name} "
+                f"| {x['must_change']:,} | {stood:.2f} | {missed:.2f} "
+                f"| {x['left_per_hour']:,.0f} | {x['speed']:.1f} | {x['contacts']} |"
+            )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Parse the command line, run, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--peer-worlds", type=int, default=8)
+    parser.add_argument("--length", type=float, default=200.0)
+    parser.add_argument("--ramp", type=float, default=1200.0)
+    options = parser.parse_args()
+    if min(options.worlds, options.peer_worlds) < 1 or options.length < 50 or options.ramp <= 0:
+        parser.error("at least one world each, 50 m, and somebody on the ramp")
+    use_all_cores()
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for case in ("on", "off"):
+            net = network(case, options.length, Path(folder))
+            for motorway in MOTORWAY:
+                demand = flows(case, motorway, options.ramp)
+                row = {"case": case, "length": options.length, "motorway": motorway, "ramp": options.ramp}
+                row["ours"] = ours(net, demand, options.worlds)
+                row["SUMO"] = theirs(net, demand, options.peer_worlds)
+                rows.append(row)
+                print(json.dumps(row), flush=True)
+    RESULTS.mkdir(exist_ok=True)
+    head = f"Regenerate: `python experiments/merge.py`. Ramps of {options.length:g} m.\n\n"
+    write_whole(RESULTS / "merge.json", json.dumps({"rows": rows}, indent=1) + "\n")
+    write_whole(RESULTS / "merge.md", head + table(rows) + "\n")
+
+
+if __name__ == "__main__":
+    main()
