@@ -25,6 +25,7 @@ from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, bundled_maps, load_map
 from limsim_jax.maps.conflicts import ConflictTable, ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
+from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.rollout import Rollout, Worlds, use_all_cores
 from limsim_jax.traffic.demand import sample_scenario
 from limsim_jax.traffic.engine import Tick, Traffic
@@ -44,12 +45,19 @@ SHARED = Path(os.environ.get("LIMSIM_SHARED_DATA", Path(__file__).parents[2] / "
 TOWNS = [f"carla_town0{n}" for n in (1, 3, 5)]
 INITIAL, IN_TOWN = 20, 50  # vehicles at the start, about
 HORIZON = 180.0  # s
+RANK = np.zeros(len(SignalState), np.int32)  # by what a light shows; who is inside at red clears first
+RANK[[SignalState.RED, SignalState.YELLOW, SignalState.RED_YELLOW]] = 2
+RANK[SignalState.GREEN_MAJOR] = 1
+RANK[[SignalState.GREEN_MINOR, SignalState.STOP]] = -1
+STANDS = 0.1  # m/s, below which SUMO counts a vehicle as waiting
 
 
-class Together:
-    """How often two vehicles are in a stretch where their lanes cross at the same time, a `rollout.Measure`.
+class Watch:
+    """What totals do not tell, a `rollout.Measure`. Counts of
 
-    The stretch is where centre lines are within 2.3 m, so two may be in it without touching.
+    pairs that are in a stretch where their lanes cross at the same time: where centre lines are within
+    2.3 m, so they may be in it without touching; of these, pairs against priority: who has to yield, by the
+    lights or else by the map, does not stand; and vehicles that have to change lanes for their goal.
     """
 
     def __init__(self, table: ConflictTable) -> None:
@@ -61,8 +69,8 @@ class Together:
             same = (foe[j] == k) & (places[j] == places[k, c][[2, 3, 0, 1]]).all(-1)
             self.mirror[k, c] = j * foe.shape[1] + int(np.argmax(same))
 
-    def _pairs(self, lane_map: LaneMap, state: State) -> jax.Array:
-        """Entries of the table `[K, C]` with somebody on either side."""
+    def _pairs(self, lane_map: LaneMap, state: State) -> tuple[jax.Array, jax.Array]:
+        """Entries of the table `[K, C]` with somebody on either side, and those against priority."""
         table = lane_map.conflicts
         behind, front = tails(lane_map, state)
         lane = jnp.concatenate([jnp.where(state.active, state.lane, NO_LANE)[:, None], behind], -1)
@@ -71,25 +79,47 @@ class Together:
         inside = (front > table.s_in[k]) & (front - state.shape.length[:, None, None] < table.s_out[k])
         inside &= (table.type[k] == ConflictType.CROSS) & (k >= 0)[..., None]
         taken = jnp.zeros(table.foe.shape, bool).at[k].max(inside)
-        return taken & taken.ravel()[self.mirror]
+        moves = jnp.zeros(table.foe.shape, bool).at[k].max(inside & (state.v >= STANDS)[:, None, None])
+        both = taken & taken.ravel()[self.mirror]
+        shows = lane_states(lane_map.signals, state.lights.phase)[table.lane]
+        rank = jnp.asarray(RANK)[shows]
+        light = jnp.sign(rank[:, None] - rank[table.foe])
+        yields = jnp.where(light != 0, light, table.prio) < 0
+        against = both & yields & moves
+        return both, against | against.ravel()[self.mirror]
+
+    def _needs(self, lane_map: LaneMap, state: State) -> tuple[jax.Array, jax.Array]:
+        """Who is in each slot, and whether it has to change lanes."""
+        to_go = lane_map.routes.lanes_to_go[state.lane, state.goal]
+        return jnp.where(state.active, state.entered, -1), state.active & (to_go != 0)
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         """Nobody has met yet."""
-        return self._pairs(lane_map, state), jnp.int32(0)
+        who, needs = self._needs(lane_map, state)
+        counts = jnp.zeros(3, jnp.int32).at[2].set(jnp.sum(needs, dtype=jnp.int32))
+        return self._pairs(lane_map, state), who, needs, counts
 
     def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
-        """Who is together after a step."""
-        return self._pairs(lane_map, tick.state)
+        """Who is together after a step, and who has to change lanes."""
+        return self._pairs(lane_map, tick.state), *self._needs(lane_map, tick.state)
 
     def update(self, config: Config, lane_map: LaneMap, carry: Any, looks: Any) -> Any:
-        """Counts those who begin to be."""
-        before, count = carry
-        begun = looks & ~jnp.concatenate([before[None], looks[:-1]])
-        return looks[-1], count + jnp.sum(begun, dtype=jnp.int32) // 2
+        """Counts pairs when they begin, and vehicles once."""
+        before, who, needs, counts = carry
+        pairs, whose, need = looks
+        begun = [
+            jnp.sum(x & ~jnp.concatenate([y[None], x[:-1]]), dtype=jnp.int32) // 2
+            for x, y in zip(pairs, before, strict=True)
+        ]
+        for step in range(whose.shape[0]):
+            needs &= who == whose[step]
+            counts = counts.at[2].add(jnp.sum(need[step] & ~needs, dtype=jnp.int32))
+            who, needs = whose[step], needs | need[step]
+        return jax.tree.map(lambda x: x[-1], pairs), who, needs, counts.at[:2].add(jnp.stack(begun))
 
     def result(self, config: Config, lane_map: LaneMap, carry: Any) -> Any:
-        """How many pairs there were."""
-        return carry[1]
+        """The counts."""
+        return carry[-1]
 
 
 def episodes(
@@ -99,13 +129,14 @@ def episodes(
     network = load_map(path)
     lane_map = build_lane_map(network)
     demand, _ = build_traffic(network, lane_map, rate=rate, vehicles=initial, seconds=HORIZON)
-    run = Rollout(Config(dt=0.1), Traffic(), HORIZON, measure=Together(lane_map.conflicts))
+    run = Rollout(Config(dt=0.1), Traffic(), HORIZON, measure=Watch(lane_map.conflicts))
     start = time.perf_counter()
     worlds = Worlds(run, lane_map, lambda key: sample_scenario(demand, lane_map, key, slots), chunk=chunk)
     worlds.compile()
     compiled = time.perf_counter()
     parts = [(result.totals, result.measures) for _, result in worlds.chunks(range(count))]
-    totals, together = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    totals, counts = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    together, against, must = (int(x) for x in counts.sum(0))
     done = time.perf_counter()
     events = {
         name: int(np.sum(getattr(totals, name)))
@@ -120,7 +151,10 @@ def episodes(
         "episodes": count,
         "slots": slots,
         "rate": rate,
-        "together": int(np.sum(together)),
+        "together": together,
+        "against_priority": against,
+        "must_change": must,
+        "missed_percent": round(100 * events["missed"] / max(must, 1), 3),
         "collided_episodes": int(np.sum(totals.collided > 0)),
         "off_road_episodes": int(np.sum(totals.off_road > 0)),
         "deceleration": round(float(np.max(totals.deceleration)), 2),
@@ -145,7 +179,10 @@ COLUMNS = {
     "wrong_way": "wrong way",
     "ran_red": "red light",
     "together": "two where lanes cross",
-    "missed": "missed lane changes",
+    "against_priority": "of these against priority",
+    "must_change": "have to change lanes",
+    "missed": "never did",
+    "missed_percent": "that is, %",
     "deceleration": "hardest braking, m/s^2",
     "full": "no slot",
     "mean_speed": "mean speed, m/s",

@@ -238,9 +238,11 @@ def choose_lane(
     matching = jnp.where(asks, pair.lead, -1)
     matching_gap = jnp.where(asks, pair.lead_gap, NO_GAP)
 
-    # courtesy: the vehicle that would be the new follower of somebody in need lets it in
+    # courtesy: the vehicle that would be the new follower of somebody in need lets it in; who starts is its
+    # leader from the next decision on
     n = me.shape[0]
-    letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(asks & follower, pair.lag, n)].max(me)[:n]
+    minds = (asks | (starts & towards)) & follower
+    letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(minds, pair.lag, n)].max(me)[:n]
     letting_gap = jnp.where(letting >= 0, pair.lag_gap[letting], NO_GAP)
     letting = jnp.where(letting_gap > 0, letting, -1)
 
