@@ -76,16 +76,36 @@ def speed(result: dict[str, Any]) -> str:
 def soundness(result: dict[str, Any]) -> str:
     """What went wrong in many episodes."""
     rows = [
-        "| map | episodes | vehicles | vehicle-km | collisions | two where lanes cross | gridlock | off road "
-        "| red light | missed lane changes | hardest braking, m/s² |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+        "| map | episodes | vehicles | vehicle-km | collisions | two where lanes cross (against priority) "
+        "| gridlock | off road | red light | have to change lanes | never did | hardest braking, m/s² |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for r in result["maps"]:
-        missed, red = (f"{100 * r[name] / r['entered']:.2f} %" for name in ("missed", "ran_red"))
         rows.append(
             f"| {r['map']} | {r['episodes']} | {r['entered']:,} | {r['vehicle_km']:,.0f} "
-            f"| {r['collided_episodes']} | {r['together']} | {r['gridlock']} | {r['off_road']} "
-            f"| {red} | {missed} | {r['deceleration']:.1f} |"
+            f"| {r['collided_episodes']} | {r['together']} ({r['against_priority']}) | {r['gridlock']} "
+            f"| {r['off_road']} | {100 * r['ran_red'] / r['entered']:.2f} % | {r['must_change']:,} "
+            f"| {r['missed_percent']:.2f} % | {r['deceleration']:.1f} |"
+        )
+    return "\n".join(rows)
+
+
+def merge(result: dict[str, Any]) -> str:
+    """Ramps of 200 m, next to SUMO."""
+    rows = [
+        "| ramp | motorway, veh/h | ramp, veh/h | have to change lanes | stood before: ours, SUMO "
+        "| never did: ours, SUMO | mean speed, m/s: ours, SUMO |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for r in result["rows"]:
+        ours, sumo = r["ours"], r["SUMO"]
+        stood, missed = (
+            ", ".join(f"{100 * x[name] / max(x['must_change'], 1):.2f} %" for x in (ours, sumo))
+            for name in ("stood", "missed")
+        )
+        rows.append(
+            f"| {r['case']} | {r['motorway']:,.0f} | {r['ramp']:,.0f} | {ours['must_change']:,} "
+            f"| {stood} | {missed} | {ours['speed']:.1f}, {sumo['speed']:.1f} |"
         )
     return "\n".join(rows)
 
@@ -271,6 +291,7 @@ TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "maps_against_carla": carla,
     "maps_against_sumo": sumo,
     "maps_speed": speed,
+    "merge": merge,
     "policies": policies,
     "soundness": soundness,
     "sweep_speed": sweep_speed,

@@ -117,16 +117,15 @@ def _coming(
     size, n = lane_map.length.shape[0], state.lane.shape[0]
     # one word that holds distance and slot, so that one scatter finds both
     slot_bits = max(1, (n - 1).bit_length())
-    most = 2 ** min(22, 31 - slot_bits)
+    unit = config.look_ahead / 2 ** min(22, 31 - slot_bits)  # m
     lane, start = ahead.lane[:, 2:], ahead.start[:, 2:]
     seen = state.active[:, None] & (lane != NO_LANE) & (start < config.look_ahead)
-    share = jnp.clip(start / config.look_ahead, 0, 1)
-    word = (share * most).astype(jnp.uint32) << slot_bits
+    word = (jnp.clip(start, 0, config.look_ahead) / unit).astype(jnp.uint32) << slot_bits
     word |= jnp.arange(n, dtype=jnp.uint32)[:, None]
     nobody = jnp.uint32(2**32 - 1)
     first = jnp.full(size, nobody).at[jnp.where(seen, lane, size)].min(word, mode="drop")
-    slot = jnp.where(first == nobody, -1, (first & (2**slot_bits - 1)).astype(jnp.int32))
-    return slot, (first >> slot_bits).astype(jnp.float32) * (config.look_ahead / most)
+    slot: Array = (first & (2**slot_bits - 1)).astype(jnp.int32)
+    return jnp.where(first < nobody, slot, -1), (first >> slot_bits).astype(jnp.float32) * unit
 
 
 def lanes_ahead(config: Config, lane_map: LaneMap) -> int:
