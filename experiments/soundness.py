@@ -50,6 +50,7 @@ RANK[[SignalState.RED, SignalState.YELLOW, SignalState.RED_YELLOW]] = 2
 RANK[SignalState.GREEN_MAJOR] = 1
 RANK[[SignalState.GREEN_MINOR, SignalState.STOP]] = -1
 STANDS = 0.1  # m/s, below which SUMO counts a vehicle as waiting
+NOSE = 0.5  # m, by which who stops to yield may be too far
 
 
 class Watch:
@@ -57,7 +58,8 @@ class Watch:
 
     pairs that are in a stretch where their lanes cross at the same time: where centre lines are within
     2.3 m, so they may be in it without touching; of these, pairs against priority: who has to yield, by the
-    lights or else by the map, does not stand; and vehicles that have to change lanes for their goal.
+    lights or else by the map, drives, more than `NOSE` inside; and vehicles that have to change lanes for
+    their goal.
     """
 
     def __init__(self, table: ConflictTable) -> None:
@@ -79,7 +81,8 @@ class Watch:
         inside = (front > table.s_in[k]) & (front - state.shape.length[:, None, None] < table.s_out[k])
         inside &= (table.type[k] == ConflictType.CROSS) & (k >= 0)[..., None]
         taken = jnp.zeros(table.foe.shape, bool).at[k].max(inside)
-        moves = jnp.zeros(table.foe.shape, bool).at[k].max(inside & (state.v >= STANDS)[:, None, None])
+        moves = inside & (front > table.s_in[k] + NOSE) & (state.v >= STANDS)[:, None, None]
+        moves = jnp.zeros(table.foe.shape, bool).at[k].max(moves)
         both = taken & taken.ravel()[self.mirror]
         shows = lane_states(lane_map.signals, state.lights.phase)[table.lane]
         rank = jnp.asarray(RANK)[shows]
