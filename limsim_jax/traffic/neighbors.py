@@ -108,22 +108,23 @@ class Shelf:
 
 
 def _coming(
-    config: Config, lane_map: LaneMap, state: State, ahead: Ahead
-) -> tuple[Int[Array, " L"], Float[Array, " L"]]:
+    config: Config, lane_map: LaneMap, state: State, ahead: Ahead, lane: Int[Array, "*b"]
+) -> tuple[Int[Array, "*b"], Float[Array, "*b"]]:
     """The next vehicle that comes to each lane over at least one other lane, and m from it to the lane.
 
     -1 where nobody comes within `config.look_ahead`.
     """
     size, n = lane_map.length.shape[0], state.lane.shape[0]
-    # one word that holds distance and slot, so that one scatter finds both
+    # one word that holds distance and slot, so that one scatter and one gather find both
     slot_bits = max(1, (n - 1).bit_length())
     unit = config.look_ahead / 2 ** min(22, 31 - slot_bits)  # m
-    lane, start = ahead.lane[:, 2:], ahead.start[:, 2:]
-    seen = state.active[:, None] & (lane != NO_LANE) & (start < config.look_ahead)
+    way, start = ahead.lane[:, 2:], ahead.start[:, 2:]
+    seen = state.active[:, None] & (way != NO_LANE) & (start < config.look_ahead)
     word = (jnp.clip(start, 0, config.look_ahead) / unit).astype(jnp.uint32) << slot_bits
     word |= jnp.arange(n, dtype=jnp.uint32)[:, None]
+    way, word = computed_once((jnp.where(seen, way, size), word))
     nobody = jnp.uint32(2**32 - 1)
-    first = jnp.full(size, nobody).at[jnp.where(seen, lane, size)].min(word, mode="drop")
+    first = computed_once(jnp.full(size, nobody).at[way].min(word, mode="drop")[lane])
     slot: Array = (first & (2**slot_bits - 1)).astype(jnp.int32)
     return jnp.where(first < nobody, slot, -1), (first >> slot_bits).astype(jnp.float32) * unit
 
@@ -272,7 +273,7 @@ def neighbors(
         nearer = upstream & ((distance[k] < lag_at) | (k == 0))
         lag, lag_at = jnp.where(nearer, vehicle[k], lag), jnp.where(nearer, distance[k], lag_at)
     if ahead is not None:
-        vehicle, start = (x[lane] for x in _coming(config, lane_map, state, ahead))
+        vehicle, start = _coming(config, lane_map, state, ahead, lane)
         distance = s + start
         nearer = upstream & (vehicle >= 0) & (vehicle != me) & ((distance < lag_at) | (lag < 0))
         lag, lag_at = jnp.where(nearer, vehicle, lag), jnp.where(nearer, distance, lag_at)
