@@ -234,17 +234,18 @@ def choose_lane(
     asks = towards & (press > COURTEOUS) & allowed & ~starts
     starts, asks = computed_once((starts, asks))
 
-    # who is in need takes the pace of the lane that it has to get to, and falls behind who is abreast
-    matching = jnp.where(asks, pair.lead, -1)
-    matching_gap = jnp.where(asks, pair.lead_gap, NO_GAP)
-
-    # courtesy: the vehicle that would be the new follower of somebody in need lets it in; who starts is its
-    # leader from the next decision on
+    # courtesy: who is in need takes the pace of the lane that it has to get to, and falls behind who is
+    # abreast; the vehicle that would be its new follower lets it in: who starts is its leader from the next
+    # decision on
     n = me.shape[0]
     minds = (asks | (starts & towards)) & follower
     letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(minds, pair.lag, n)].max(me)[:n]
-    letting_gap = jnp.where(letting >= 0, pair.lag_gap[letting], NO_GAP)
-    letting = jnp.where(letting_gap > 0, letting, -1)
+    letting_gap = pair.lag_gap[letting]
+    lets = (letting >= 0) & (letting_gap > 0)
+    courtesy = Obstacles(
+        jnp.stack([jnp.where(lets, letting, -1), jnp.where(asks, pair.lead, -1)], -1),
+        jnp.stack([jnp.where(lets, letting_gap, NO_GAP), jnp.where(asks, pair.lead_gap, NO_GAP)], -1),
+    )
 
     # of two abreast that need each other's lanes the one that will be behind stops behind the other: else
     # both wait at the ends of their lanes for good
@@ -257,7 +258,7 @@ def choose_lane(
     swaps &= (wanted[abreast] == -wanted) & (press[abreast] > 0)
     return LaneChoice(
         side=jnp.where(starts, side, 0),
-        courtesy=Obstacles(jnp.stack([letting, matching], -1), jnp.stack([letting_gap, matching_gap], -1)),
+        courtesy=courtesy,
         stops_before=jnp.where(swaps, shape.length[abreast] + BEHIND, 0),
     )
 
