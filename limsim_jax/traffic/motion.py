@@ -57,28 +57,23 @@ def accelerations(
 ) -> Float[Array, " N"]:
     """Acceleration (m/s^2) of every vehicle, `x` m after the decision: the least that any obstacle asks."""
     driver = state.driver
-    courtesies = decision.courtesy.other.shape[-1]
-    # vehicles last: XLA vectorises along their axis
-    index, gap0 = (
-        jnp.concatenate([x.T, y.T]) for x, y in zip(decision.courtesy, decision.obstacles, strict=True)
-    )
+    index, gap0 = (x.T for x in decision.obstacles)  # vehicles last: XLA vectorises along their axis
     moving = index >= 0
 
-    def seen(value: Float[Array, " N"]) -> Float[Array, "K N"]:
-        return jnp.where(moving, value[index], 0)
+    def seen(index: Int[Array, "*b"], value: Float[Array, " N"]) -> Float[Array, "*b"]:
+        return jnp.where(index >= 0, value[index], 0)
 
     none = (gap0 >= NO_GAP) | (moving & ~state.active[index])  # who leaves the map is no obstacle
-    gap = jnp.where(none, NO_GAP, gap0 + seen(x) - x[None])
-    v_lead = jnp.where(none, state.v[None], seen(state.v))
-    a_lead = seen(state.a).at[:courtesies].set(0)  # courtesy minds speeds only
+    gap = jnp.where(none, NO_GAP, gap0 + seen(index, x) - x[None])
+    v_lead = jnp.where(none, state.v[None], seen(index, state.v))
+    a_lead = jnp.where(moving, seen(index, state.a), 0)
     gap, v_lead, a_lead = computed_once((gap, v_lead, a_lead))
     # slow down in time for what comes: the speed from which `v_ahead` is reached with a part of b
     room = jnp.maximum(decision.ahead - x, 0)
     reach = jnp.sqrt(decision.v_ahead**2 + 2 * _APPROACH * driver.b * room + 1e-6)
     v0 = jnp.minimum(decision.v0, reach)
     each, v, v_free = jax.tree.map(lambda value: value[None], (driver, state.v, v0))
-    asked = model(each, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free)
-    kind, a = asked[:courtesies].min(0), asked[courtesies:].min(0)
+    a = model(each, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free).min(0)
     # the models only lag behind a desired speed that falls: who is above it brakes as hard as that takes
     need = (state.v * state.v - decision.v_ahead**2) / (2 * jnp.maximum(room, 0.5))
     a = jnp.where(state.v > reach, jnp.minimum(a, -jnp.clip(need, 0, driver.b)), a)
@@ -87,6 +82,11 @@ def accelerations(
     need = state.v * state.v / (2 * jnp.maximum(line, 0.02))
     rolls = (state.v < WALKING_SPEED) & (line < 1.0) & (need > 0.5)
     a = jnp.where(rolls, jnp.minimum(a, -jnp.minimum(need, _HALT)), a)
+    index, gap0 = (x.T for x in decision.courtesy)
+    minds = (index >= 0) & state.active[index]
+    gap = jnp.where(minds, gap0 + seen(index, x) - x[None], NO_GAP)
+    v_lead = jnp.where(minds, seen(index, state.v), state.v[None])
+    kind = model(each, gap=gap, v=v, v_lead=v_lead, a_lead=jnp.zeros_like(gap), v0=v_free).min(0)
     return jnp.minimum(a, jnp.maximum(kind, -COURTESY))
 
 
