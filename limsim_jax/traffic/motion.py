@@ -6,6 +6,7 @@ gap now is that gap plus what the obstacle has travelled since, less what the ve
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
 from typing import NamedTuple
@@ -51,6 +52,15 @@ COURTESY = 2.0
 """m/s^2, the hardest braking to let somebody in, or to find a place on the next lane."""
 
 
+def _least(rows: Float[Array, "K N"]) -> Float[Array, " N"]:
+    """The least of each column.
+
+    The gradient of `min` looks for what equals it and divides by how many do: none, where XLA works the rows
+    out twice and rounds them otherwise.
+    """
+    return functools.reduce(lambda x, y: jnp.where(x < y, x, y), rows)
+
+
 @jax.named_scope("accelerations")
 def accelerations(
     model: CarFollowing, state: State, decision: Decision, x: Float[Array, " N"]
@@ -73,7 +83,7 @@ def accelerations(
     reach = jnp.sqrt(decision.v_ahead**2 + 2 * _APPROACH * driver.b * room + 1e-6)
     v0 = jnp.minimum(decision.v0, reach)
     each, v, v_free = jax.tree.map(lambda value: value[None], (driver, state.v, v0))
-    a = model(each, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free).min(0)
+    a = _least(model(each, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free))
     # the models only lag behind a desired speed that falls: who is above it brakes as hard as that takes
     need = (state.v * state.v - decision.v_ahead**2) / (2 * jnp.maximum(room, 0.5))
     a = jnp.where(state.v > reach, jnp.minimum(a, -jnp.clip(need, 0, driver.b)), a)
@@ -86,7 +96,7 @@ def accelerations(
     minds = (index >= 0) & state.active[index]
     gap = jnp.where(minds, gap0 + seen(index, x) - x[None], NO_GAP)
     v_lead = jnp.where(minds, seen(index, state.v), state.v[None])
-    kind = model(each, gap=gap, v=v, v_lead=v_lead, a_lead=jnp.zeros_like(gap), v0=v_free).min(0)
+    kind = _least(model(each, gap=gap, v=v, v_lead=v_lead, a_lead=jnp.zeros_like(gap), v0=v_free))
     return jnp.minimum(a, jnp.maximum(kind, -COURTESY))
 
 
