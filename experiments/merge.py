@@ -13,31 +13,29 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import tempfile
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+from soundness import STANDS, Changes
 
 from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, load_map
-from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.rollout import Rollout, Worlds, use_all_cores
 from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
-from limsim_jax.traffic.engine import Tick, Traffic
+from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.vehicles import default_population, fitting
-from limsim_jax.types import Config, State, Status
+from limsim_jax.types import Config
 
 RESULTS = Path(__file__).parent / "results"
 MOTORWAY = (1200.0, 2400.0, 3600.0, 4800.0)  # veh/h on its three lanes
 HORIZON = 600.0  # s
 SLOTS = 256
 DT = 0.1  # s, of both
-STANDS = 0.1  # m/s, below which SUMO counts a vehicle as waiting
 FAST, SLOW = 33.33, 22.22  # m/s
 UPSTREAM, DOWNSTREAM, RAMP = 800.0, 600.0, 300.0  # m
 WIDTH = 3.2  # m, netconvert's lanes
@@ -45,7 +43,7 @@ WIDTH = 3.2  # m, netconvert's lanes
 
 def network(case: str, length: float, folder: Path) -> Path:
     """A motorway with a ramp, from SUMO's netconvert."""
-    from sumo import SUMO_HOME  # pyright: ignore[reportMissingImports]
+    from maps_against_sumo import run_sumo  # needs SUMO
 
     on, edge = case == "on", -3 * WIDTH  # lanes lie to the right of their edge
     course = [(-RAMP, edge - 0.1 * RAMP), (-RAMP / 3, edge), (0.0, edge)]
@@ -55,11 +53,12 @@ def network(case: str, length: float, folder: Path) -> Path:
     nodes = [f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in points.items()]
     roads = {"before": ("west", "a", 3, FAST), "beside": ("a", "b", 4, FAST), "after": ("b", "east", 3, FAST)}
     roads["ramp"] = ("far", "a", 1, SLOW) if on else ("b", "far", 1, SLOW)
-    shape = {"ramp": f'shape="{" ".join(f"{x},{y}" for x, y in course)}"'}
     edges = [
-        f'<edge id="{name}" from="{a}" to="{b}" numLanes="{lanes}" speed="{speed}" {shape.get(name, "")}/>'
+        f'<edge id="{name}" from="{a}" to="{b}" numLanes="{lanes}" speed="{speed}"/>'
         for name, (a, b, lanes, speed) in roads.items()
     ]
+    shape = " ".join(f"{x},{y}" for x, y in course)
+    edges[-1] = edges[-1].replace("/>", f' shape="{shape}"/>')
     links = [("before", k, "beside", k + 1) for k in range(3)] + [
         ("beside", k + 1, "after", k) for k in range(3)
     ]
@@ -72,9 +71,8 @@ def network(case: str, length: float, folder: Path) -> Path:
     ):
         (folder / f"{name}.xml").write_text(f"<{kind}>{''.join(lines)}</{kind}>")
     net = folder / f"{case}.net.xml"
-    command = [Path(SUMO_HOME) / "bin" / "netconvert", "--no-turnarounds", "true", "-o", net]
-    command += ["-n", folder / "nod.xml", "-e", folder / "edg.xml", "-x", folder / "con.xml"]
-    subprocess.run([str(x) for x in command], check=True, capture_output=True)
+    parts = f"-n {folder}/nod.xml -e {folder}/edg.xml -x {folder}/con.xml"
+    run_sumo("netconvert", f"--no-turnarounds true {parts} -o {net}")
     return net
 
 
@@ -83,41 +81,6 @@ def flows(case: str, motorway: float, ramp: float) -> list[tuple[str, str, float
     if case == "on":
         return [("before", "after", motorway), ("ramp", "after", ramp)]
     return [("before", "after", motorway - ramp), ("before", "ramp", ramp)]
-
-
-class Changes:
-    """Who has to change lanes for its goal, who stood before that was done, who never did: a `Measure`."""
-
-    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
-        """Nobody is there yet."""
-        nobody = jnp.zeros(state.active.shape, bool)
-        return state.entered, nobody, nobody, nobody, jnp.zeros(3, jnp.int32)
-
-    def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
-        """What counts of a step."""
-        state = tick.state
-        must = lane_map.routes.lanes_to_go[state.lane, state.goal] != 0
-        missed = (state.status & int(Status.MISSED_ROUTE)) != 0
-        must, missed = state.active & must, state.active & missed
-        return jnp.where(state.active, state.entered, -1), must, must & (state.v < STANDS), missed
-
-    def update(self, config: Config, lane_map: LaneMap, carry: Any, looks: Any) -> Any:
-        """Counts everybody once."""
-
-        def step(carry: Any, now: Any) -> tuple[Any, None]:
-            who, *known, counts = carry
-            same = who == now[0]
-            known = [same & x for x in known]
-            counts += jnp.stack(
-                [jnp.sum(x & ~y, dtype=jnp.int32) for x, y in zip(now[1:], known, strict=True)]
-            )
-            return (now[0], *(x | y for x, y in zip(now[1:], known, strict=True)), counts), None
-
-        return jax.lax.scan(step, carry, looks)[0]
-
-    def result(self, config: Config, lane_map: LaneMap, carry: Any) -> Any:
-        """How many."""
-        return carry[-1]
 
 
 def ours(net: Path, demand: list[tuple[str, str, float]], worlds: int) -> dict[str, Any]:
@@ -161,11 +124,11 @@ def theirs(net: Path, demand: list[tuple[str, str, float]], worlds: int) -> dict
     for seed in range(worlds):
         options = ["-n", str(net), "-r", str(routes), "--step-length", str(DT), "--seed", str(seed)]
         libsumo.start(["sumo", *options, "--no-step-log", "--no-warnings", "--xml-validation", "never"])
-        come, stand, gone = set[str](), set[str](), set[str]()
+        come, stand, gone, hit = set[str](), set[str](), set[str](), set[str]()
         for _ in range(round(HORIZON / DT)):
             libsumo.simulationStep()
             left += libsumo.simulation.getArrivedNumber()
-            contacts += libsumo.simulation.getCollidingVehiclesNumber()
+            hit |= set(libsumo.simulation.getCollidingVehiclesIDList())
             gone |= set(libsumo.simulation.getStartingTeleportIDList())
             for name in libsumo.vehicle.getIDList():
                 v = libsumo.vehicle.getSpeed(name)
@@ -178,7 +141,8 @@ def theirs(net: Path, demand: list[tuple[str, str, float]], worlds: int) -> dict
                 waits = lane.startswith("beside") and (lane != "beside_0") == off
                 stand |= {name} if waits and v < STANDS else set()
         libsumo.close()
-        must, stood, missed = must + len(come), stood + len(stand), missed + len(gone)
+        must, stood, missed = must + len(come), stood + len(stand), missed + len(gone & come)
+        contacts += len(hit)
     return {
         "must_change": must,
         "stood": stood,
@@ -216,8 +180,13 @@ def main() -> None:
     parser.add_argument("--length", type=float, default=200.0)
     parser.add_argument("--ramp", type=float, default=1200.0)
     options = parser.parse_args()
-    if min(options.worlds, options.peer_worlds) < 1 or options.length < 50 or options.ramp <= 0:
-        parser.error("at least one world each, 50 m, and somebody on the ramp")
+    for name, least in (("worlds", 1), ("peer_worlds", 1), ("length", 50), ("ramp", 1)):
+        if not getattr(options, name) >= least:
+            parser.error(f"--{name.replace('_', '-')} {getattr(options, name):g}: at least {least}")
+    if options.ramp > min(MOTORWAY):
+        parser.error(f"--ramp {options.ramp:g}: at most {min(MOTORWAY):g}, who leaves was on the motorway")
+    if not find_spec("sumo") or not find_spec("libsumo"):
+        parser.error("SUMO is missing: pip install eclipse-sumo libsumo")
     use_all_cores()
     rows = []
     with tempfile.TemporaryDirectory() as folder:

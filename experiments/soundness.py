@@ -30,7 +30,7 @@ from limsim_jax.rollout import Rollout, Worlds, use_all_cores
 from limsim_jax.traffic.demand import sample_scenario
 from limsim_jax.traffic.engine import Tick, Traffic
 from limsim_jax.traffic.motion import tails
-from limsim_jax.types import Config, State
+from limsim_jax.types import Config, State, Status
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -53,16 +53,51 @@ STANDS = 0.1  # m/s, below which SUMO counts a vehicle as waiting
 NOSE = 0.5  # m, by which who stops to yield may be too far
 
 
+class Changes:
+    """Who has to change lanes for its goal, who of these stands before that is done, who never does it.
+
+    A `rollout.Measure`; everybody counts once.
+    """
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """Nobody is there yet."""
+        nobody = jnp.zeros((3, *state.active.shape), bool)
+        return state.entered, nobody, jnp.zeros(3, jnp.int32)
+
+    def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
+        """Who is in each slot after a step, and which of the three it is."""
+        state = tick.state
+        must = lane_map.routes.lanes_to_go[state.lane, state.goal] != 0
+        missed = (state.status & int(Status.MISSED_ROUTE)) != 0
+        each = jnp.stack([must, must & (state.v < STANDS), missed])
+        return jnp.where(state.active, state.entered, -1), state.active & each
+
+    def update(self, config: Config, lane_map: LaneMap, carry: Any, looks: Any) -> Any:
+        """Counts who was not known."""
+
+        def step(carry: Any, look: Any) -> tuple[Any, None]:
+            who, known, counts = carry
+            known &= who == look[0]
+            counts += jnp.sum(look[1] & ~known, -1, dtype=jnp.int32)
+            return (look[0], known | look[1], counts), None
+
+        return jax.lax.scan(step, carry, looks)[0]
+
+    def result(self, config: Config, lane_map: LaneMap, carry: Any) -> Any:
+        """How many: have to, stood, never did."""
+        return carry[-1]
+
+
 class Watch:
     """What totals do not tell, a `rollout.Measure`. Counts of
 
     pairs that are in a stretch where their lanes cross at the same time: where centre lines are within
     2.3 m, so they may be in it without touching; of these, pairs against priority: who has to yield, by the
-    lights or else by the map, drives, more than `NOSE` inside; and vehicles that have to change lanes for
-    their goal.
+    lights or else by the map, drives, more than `NOSE` inside; and `Changes`.
     """
 
     def __init__(self, table: ConflictTable) -> None:
+        self.changes = Changes()
         foe, cross = np.asarray(table.foe), np.asarray(table.type) == ConflictType.CROSS
         places = np.stack([np.asarray(x) for x in (table.s_in, table.s_out, table.f_in, table.f_out)], -1)
         self.mirror = np.zeros(foe.shape, np.int32)  # place in the flat table of the entry seen from the foe
@@ -91,38 +126,28 @@ class Watch:
         against = both & yields & moves
         return both, against | against.ravel()[self.mirror]
 
-    def _needs(self, lane_map: LaneMap, state: State) -> tuple[jax.Array, jax.Array]:
-        """Who is in each slot, and whether it has to change lanes."""
-        to_go = lane_map.routes.lanes_to_go[state.lane, state.goal]
-        return jnp.where(state.active, state.entered, -1), state.active & (to_go != 0)
-
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         """Nobody has met yet."""
-        who, needs = self._needs(lane_map, state)
-        counts = jnp.zeros(3, jnp.int32).at[2].set(jnp.sum(needs, dtype=jnp.int32))
-        return self._pairs(lane_map, state), who, needs, counts
+        met = jnp.zeros(2, jnp.int32)
+        return self._pairs(lane_map, state), met, self.changes.init(config, lane_map, state)
 
     def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
         """Who is together after a step, and who has to change lanes."""
-        return self._pairs(lane_map, tick.state), *self._needs(lane_map, tick.state)
+        return self._pairs(lane_map, tick.state), self.changes.look(config, lane_map, tick)
 
     def update(self, config: Config, lane_map: LaneMap, carry: Any, looks: Any) -> Any:
         """Counts pairs when they begin, and vehicles once."""
-        before, who, needs, counts = carry
-        pairs, whose, need = looks
+        (before, met, changes), (pairs, whose) = carry, looks
         begun = [
             jnp.sum(x & ~jnp.concatenate([y[None], x[:-1]]), dtype=jnp.int32) // 2
             for x, y in zip(pairs, before, strict=True)
         ]
-        for step in range(whose.shape[0]):
-            needs &= who == whose[step]
-            counts = counts.at[2].add(jnp.sum(need[step] & ~needs, dtype=jnp.int32))
-            who, needs = whose[step], needs | need[step]
-        return jax.tree.map(lambda x: x[-1], pairs), who, needs, counts.at[:2].add(jnp.stack(begun))
+        last = jax.tree.map(lambda x: x[-1], pairs)
+        return last, met + jnp.stack(begun), self.changes.update(config, lane_map, changes, whose)
 
     def result(self, config: Config, lane_map: LaneMap, carry: Any) -> Any:
-        """The counts."""
-        return carry[-1]
+        """Pairs together, of these against priority, and what `Changes` has counted."""
+        return jnp.concatenate([carry[1], self.changes.result(config, lane_map, carry[-1])])
 
 
 def episodes(
@@ -139,7 +164,7 @@ def episodes(
     compiled = time.perf_counter()
     parts = [(result.totals, result.measures) for _, result in worlds.chunks(range(count))]
     totals, counts = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    together, against, must = (int(x) for x in counts.sum(0))
+    together, against, must, *_ = (int(x) for x in counts.sum(0))
     done = time.perf_counter()
     events = {
         name: int(np.sum(getattr(totals, name)))
@@ -219,6 +244,9 @@ def main() -> None:
     parser.add_argument("--rate", type=float)
     parser.add_argument("--out", default="soundness")
     options = parser.parse_args()
+    for name in ("episodes", "town_episodes", "chunk"):
+        if getattr(options, name) < 1:
+            parser.error(f"--{name.replace('_', '-')} {getattr(options, name)}: at least 1")
     check_maps(parser, options.map)
     use_all_cores()
     file = RESULTS / f"{options.out}.json"

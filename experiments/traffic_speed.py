@@ -30,11 +30,12 @@ def table(rows: list[dict[str, Any]]) -> str:
         peer = r["peer"] or {}
         sumo = f"{peer['vehicle_updates_per_s']:.3g}" if "vehicle_updates_per_s" in peer else "not run"
         ratio = f"{r['ratio']:.1f}" if r.get("ratio") else ""
-        load = "" if r["load_s"] is None else f"{r['load_s']:.1f}"
+        compiled, loaded = (None, r["compile_s"]) if r["from_cache"] else (r["compile_s"], r["load_s"])
+        compiled, loaded = ("" if x is None else f"{x:.1f}" for x in (compiled, loaded))
         lines.append(
             f"| {r['map']} | {r['worlds']} x {r['vehicles']} | {r['mean_vehicles']:.1f} "
             f"| {r['vehicle_updates_per_s']:.3g} | {r['slot_updates_per_s']:.3g} | {sumo} | {ratio} "
-            f"| {r['compile_s']:.1f} | {load} | {r['peak_memory'] / 1e6:.0f} |"
+            f"| {compiled} | {loaded} | {r['peak_memory'] / 1e6:.0f} |"
         )
     first = rows[0]
     lines += ["", f"{first['device']}, {first['cores']} cores, steps of {first['dt']:g} s, float32."]

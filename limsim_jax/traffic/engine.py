@@ -227,11 +227,9 @@ def _behind_tails(lane_map: LaneMap, state: State, ahead: Ahead, own: Pair) -> P
 
 def _stay(state: State) -> LaneChoice:
     stay = jnp.zeros_like(state.side)
-    none = jnp.zeros_like(state.v)
     nobody = jnp.stack([stay - 1] * 2, -1)
-    return LaneChoice(
-        side=stay, courtesy=Obstacles(nobody, jnp.full(nobody.shape, NO_GAP)), stops_before=none
-    )
+    courtesy = Obstacles(nobody, jnp.full(nobody.shape, NO_GAP))
+    return LaneChoice(side=stay, courtesy=courtesy, stops_before=jnp.zeros_like(state.v))
 
 
 def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N"]:
