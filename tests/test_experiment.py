@@ -138,6 +138,16 @@ WRONG = {  # what to replace, by what, and the message
         'goal = "2"\npolicy = "constant_speed"\noptions = { speed = -1.0 }',
         "ego.options: speed: -1.0 m/s",
     ),
+    "no such option": (
+        'goal = "2"',
+        'goal = "2"\npolicy = "constant_speed"\noptions = { sped = 1.0 }',
+        "ego.options: sped: no such option; there are speed",
+    ),
+    "no such option of the planner around": (
+        'goal = "2"',
+        'goal = "2"\npolicy = "area_of_interest"\noptions = { options = { share = 1.0 } }',
+        "ego.options: share: no such option; there are .*search",
+    ),
     "no such metric": (
         "horizon = 20.0",
         "horizon = 20.0\nsuccess = { goodness = 1 }",

@@ -52,14 +52,19 @@ class Calibration:
     predictive: dict[str, float]  # check of a law from the first part of the time, in the rest of it
     seconds: float
 
+    @property
+    def population(self) -> Law:
+        """The drivers' law. Raises `ValueError` where there are too few of them."""
+        if self.law is None:
+            raise ValueError(f"a population from {len(self.fit.drivers)} drivers; at least 3 are needed")
+        return self.law
+
     def write_population(
         self, path: str | Path, *, classes: Sequence[str] = ("car",), speed_limit: float | None = None
     ) -> None:
         """The population as a file for scenarios. Raises `ValueError` where there are too few drivers."""
-        if self.law is None:
-            raise ValueError(f"a population from {len(self.fit.drivers)} drivers; at least 3 are needed")
         sources = [quality.source for quality in self.quality]
-        write_population(self.law, path, sources=sources, classes=classes, speed_limit=speed_limit)
+        write_population(self.population, path, sources=sources, classes=classes, speed_limit=speed_limit)
 
     def as_json(self) -> dict[str, Any]:
         """Everything but the segments, as plain values."""

@@ -76,8 +76,7 @@ def calibrate(
     print(found.text())
     result, content = found, found.as_json()
     if linked is not None:
-        if found.law is None:
-            raise ValueError(f"a population from {len(found.fit.drivers)} drivers; at least 3 are needed")
+        _ = found.population  # refuses too few drivers, before the rest is fitted
         result = calibrate_closed_loop(
             linked,
             gather(recordings, shortest=shortest)[0],

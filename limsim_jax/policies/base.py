@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import jax
@@ -35,6 +37,20 @@ class Policy(Protocol):
     ) -> tuple[Command, Any]:
         """What the egos do until the next decision, and the new memory. `key` is of this decision."""
         ...
+
+
+def made(factory: Callable[..., Policy], options: Mapping[str, Any]) -> Policy:
+    """The policy that an experiment file describes.
+
+    Raises:
+      ValueError: an option that there is not, or a value that makes no sense.
+    """
+    takes = inspect.signature(factory).parameters
+    anything = any(x.kind is inspect.Parameter.VAR_KEYWORD for x in takes.values())
+    for name in options:
+        if name not in takes and not anything:
+            raise ValueError(f"{name}: no such option; there are {', '.join(takes) or 'none'}")
+    return factory(**options)
 
 
 def variants(policy: Any, seen: Predictor) -> dict[str, Policy]:

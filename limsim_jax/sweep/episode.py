@@ -31,7 +31,7 @@ from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import NEAR_MISS, Rss
 from limsim_jax.metrics.traffic import NAMES as TRAFFIC_NAMES
 from limsim_jax.policies import POLICIES
-from limsim_jax.policies.base import Policy, variants
+from limsim_jax.policies.base import Policy, made, variants
 from limsim_jax.policies.predict import Recalled, straight
 from limsim_jax.rollout import (
     Carry,
@@ -372,7 +372,7 @@ def _policy(experiment: Experiment) -> Policy:
             f"{where}: unknown policy '{name}'; known are {', '.join(POLICIES)}, or module:factory"
         )
     try:
-        policy = factory(**options)
+        policy = made(factory, options)
     except (TypeError, ValueError) as error:
         raise ExperimentError(f"{experiment.name}: ego.options: {error}") from None
     if not isinstance(getattr(policy, "free", None), bool):
