@@ -42,7 +42,7 @@ SLOTS = {"highway": 128, "ramp": 128, "long_route": 128}
 """Vehicles at once; other bundled maps: 64, towns: 128."""
 
 SHARED = Path(os.environ.get("LIMSIM_SHARED_DATA", Path(__file__).parents[2] / "shared" / "data"))
-TOWNS = [f"carla_town0{n}" for n in (1, 3, 5)]
+TOWNS = sorted((SHARED / "opendrive").glob("carla_*.xodr"))
 INITIAL, IN_TOWN = 20, 50  # vehicles at the start, about
 HORIZON = 180.0  # s
 RANK = np.zeros(len(SignalState), np.int32)  # by what a light shows; who is inside at red clears first
@@ -234,12 +234,9 @@ def check_maps(parser: argparse.ArgumentParser, names: list[str]) -> None:
 def main() -> None:
     """Parse the command line, run, write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    towns = [str(SHARED / "opendrive" / f"{name}.xodr") for name in TOWNS]
     parser.add_argument("--episodes", type=int, default=1920)
     parser.add_argument("--town-episodes", type=int, default=192)
-    parser.add_argument(
-        "--map", nargs="*", default=[*bundled_maps(), *(x for x in towns if Path(x).exists())]
-    )
+    parser.add_argument("--map", nargs="*", default=[*bundled_maps(), *map(str, TOWNS)])
     parser.add_argument("--chunk", type=int, default=64)
     parser.add_argument("--rate", type=float)
     parser.add_argument("--out", default="soundness")
