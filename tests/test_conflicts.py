@@ -38,11 +38,11 @@ REACH = VEHICLE_WIDTH + MARGIN
 
 
 def entries(net, table=None, **options):
-    """Every entry by lane ids: (lane, foe) -> list of dicts."""
+    """Every entry but sweeps by lane ids: (lane, foe) -> list of dicts."""
     table = build_conflicts(net, rows(net), **options) if table is None else table
     ids = list(rows(net))
     found = {}
-    for k, c in zip(*np.nonzero(table.foe >= 0), strict=True):
+    for k, c in zip(*np.nonzero((table.foe >= 0) & (table.type != ConflictType.SWEEP)), strict=True):
         key = ids[table.lane[k]], ids[table.lane[table.foe[k, c]]]
         names = ("s_in", "s_out", "f_in", "f_out", "type", "prio", "tie")
         found.setdefault(key, []).append({name: getattr(table, name)[k, c].item() for name in names})
@@ -170,6 +170,41 @@ def test_oncoming_lanes_and_other_sections_of_one_road_are_apart():
     beyond = straight("b", (30, 1.75), 0.0, 30.0, road="r", section=1, junction="J")
     assert not entries(network([a, oncoming])) and not entries(network([a, beyond]))
     assert entries(network([a, dataclasses.replace(oncoming, road="other")]))
+
+
+def sweeps(net):
+    """(lane, foe) -> 1/m^2 of the lane and of the foe, where only the ends of bodies meet."""
+    table, ids = build_conflicts(net, rows(net)), list(rows(net))
+    return {
+        (ids[table.lane[k]], ids[table.lane[table.foe[k, c]]]): (table.sweep[k, c], table.f_sweep[k, c])
+        for k, c in np.argwhere(table.type == ConflictType.SWEEP)
+    }
+
+
+def test_ends_of_long_bodies_meet_where_turns_pass_back_to_back():
+    """Each end stands out by l^2 / 8r: of equal bodies they meet where l^2 / 4r is the room between."""
+    r, other, apart = 9.0, 14.0, 3.4
+    one = arc("one", (0.0, 0.0), r, -0.9, 1.8, junction="J")
+    two = arc("two", (r + apart + other, 0.0), other, math.pi - 0.7, 1.4, junction="J")
+    net = network([one, two])
+    assert not entries(net)
+    found = sweeps(net)
+    room = apart - REACH
+    assert found["one", "two"] == pytest.approx((1 / (8 * r * room), 1 / (8 * other * room)), rel=0.01)
+    assert found["two", "one"] == found["one", "two"][::-1]
+    table = build_conflicts(net, rows(net))
+    assert (table.prio == 0).all() and (table.clear_s == 0).all() and (table.cross_s == 0).all()
+    # all of it where the longest come too close: ends of 12 m, at most 1.5 m out on the one side
+    for k, c in np.argwhere(table.type == ConflictType.SWEEP):
+        assert 0 < table.s_in[k, c] < table.length[k] / 2 < table.s_out[k, c] < table.length[k]
+
+
+def test_of_turns_side_by_side_only_the_inner_one_sweeps():
+    inner, outer = (arc(name, (0, 0), r, 0.0, 1.5, junction="J") for name, r in (("in", 7.0), ("out", 10.0)))
+    sweep, f_sweep = sweeps(network([inner, outer]))["in", "out"]
+    assert sweep == pytest.approx(1 / (8 * 7.0 * (3.0 - REACH)), rel=0.02) and f_sweep == 0
+    ahead = [straight(name, (0.0, y), 0.0, 20.0, junction="J") for name, y in (("a", 0.0), ("b", 2.6))]
+    assert not sweeps(network(ahead))
 
 
 def test_a_lane_does_not_conflict_with_what_follows_it():

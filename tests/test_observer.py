@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from traffic_worlds import bundled, drivers, shapes
 
+from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, elevation, pose, width
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.metrics.observer import EvaluateEgo, Look, _meets_ego
@@ -435,7 +436,7 @@ def test_conflict_zones_and_who_is_in_them():
             row = table.connector[at]
             for c in range(count) if row >= 0 else ():
                 foe = table.foe[row, c]
-                if foe < 0:
+                if foe < 0 or table.type[row, c] == ConflictType.SWEEP:
                     continue
                 front = dict(parts(state, slot)).get(at, -1.0)
                 long = state.shape.length[slot]
@@ -462,7 +463,7 @@ def test_conflict_zones_and_who_is_in_them():
 def with_foes(count: int) -> LaneMap:
     """The map with no more than so many conflicts of each connector."""
     table = crossing().conflicts
-    names = "foe s_in s_out f_in f_out type prio tie".split()
+    names = "foe s_in s_out f_in f_out type prio tie sweep f_sweep".split()
     table = dataclasses.replace(table, **{name: getattr(table, name)[:, :count] for name in names})
     return dataclasses.replace(crossing(), conflicts=table)
 

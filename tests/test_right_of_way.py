@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import curve_fit
-from synthetic import intersection
-from traffic_worlds import bundled, drivers, state_of
+from synthetic import arc, curve, intersection, network, straight
+from traffic_worlds import bundled, drivers, shapes, state_of
 
 from limsim_jax.maps.lane_map import LaneMap, build_lane_map, lane_rows
 from limsim_jax.maps.network import Control
@@ -19,8 +19,8 @@ from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.signals import SignalState, phase_at
 from limsim_jax.rollout import Rollout, world_key
 from limsim_jax.traffic import right_of_way
-from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
-from limsim_jax.traffic.engine import Traffic, drive
+from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario, start_state
+from limsim_jax.traffic.engine import Command, Traffic, decide, drive
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.right_of_way import Rows, travel_time
 from limsim_jax.traffic.signals import DETECTOR, GAP, switch
@@ -184,13 +184,111 @@ def test_yellow_is_a_dilemma_that_the_braking_decides():
     np.testing.assert_array_equal(stops(SignalState.RED), needed <= 0.9 * 8)
     assert not stops(SignalState.GREEN_MAJOR).any() and not stops(SignalState.OFF).any()
     assert stops(SignalState.RED_YELLOW)[v < 4].any()
-    # who has begun to brake is slower than it was and looks nearer: it goes on while its own b is enough
+    # who brakes was faster: what it could do then counts, and it goes on while its own b is enough
     b = rng.uniform(2, 8, n).astype(np.float32)
     driver = dataclasses.replace(state.driver, b=jnp.asarray(b))
     braking = dataclasses.replace(state, a=jnp.full(n, -1.5), driver=driver)
-    begun = stops(SignalState.YELLOW, braking) & ~stops(SignalState.YELLOW)
-    np.testing.assert_array_equal(begun, ~stops(SignalState.YELLOW) & (needed <= b))
-    assert begun.any() and not stops(SignalState.YELLOW, dataclasses.replace(braking, a=0 * b))[begun].any()
+    v_then = v + 1.5 * since
+    then = line + (v + v_then) / 2 * since
+    late = 2 * then > 2.5 * (v_then + 20)
+    could = v_then**2 / (2 * then) <= np.where(late, 4.5, 3.0)
+    np.testing.assert_array_equal(stops(SignalState.YELLOW, braking), could | (needed <= b))
+    assert (could & (needed > b)).any() and (~could & (needed <= b)).any()
+    # who clears the junction goes before who has green from the side, but not before who still comes
+    inside = rows._replace(line=jnp.full((n, 2), -3.0))
+    for light, priority in ((SignalState.YELLOW, 0), (SignalState.RED, 2)):
+        _, major = right_of_way._lights(state, inside, speed, jnp.full(4, int(light)), shown)
+        assert (np.asarray(major) == priority).all()
+
+
+def test_who_stops_at_yellow_goes_on_stopping():
+    """Braking evenly, however fast it was, however slow it has become, and late in a long yellow."""
+    v, line = (x.ravel() for x in np.meshgrid(np.linspace(5, 30, 26), np.linspace(5, 160, 32)))
+    brake = v * v / (2 * line)
+    v, line, brake = (x[brake <= 3.0] for x in (v, line, brake))
+    n, speed = len(v), jnp.full((len(v), 2), 29.0)
+    for share in (0.0, 0.2, 0.5, 0.8, 0.95):
+        since = share * v / brake
+        state = state_of("highway", [0] * n, [0.0] * n, v - brake * since, [0] * n)
+        state = dataclasses.replace(state, a=jnp.asarray(-brake if share else 0 * v, jnp.float32))
+        left = line - v * since + brake * since**2 / 2
+        shown = jnp.asarray(np.stack([since, since], -1), jnp.float32)
+        yellow = jnp.full(4, int(SignalState.YELLOW))
+        where, _ = right_of_way._lights(state, rows_of(left + 1e-3, n), speed, yellow, shown)
+        assert (np.asarray(where)[:, 0] < 1e5).all(), share
+
+
+def approaches(turn, foe):
+    """Two connectors of one junction, each behind 40 m of lane that leads straight into it."""
+    lanes = []
+    for lane in (turn, foe):
+        at, heading = lane.pose(np.zeros(1))[:2]
+        before = at[0, :2] - 40.0 * np.array([np.cos(heading[0]), np.sin(heading[0])])
+        after = (lane.id,)
+        lanes += [straight("to_" + lane.id, before, float(heading[0]), 40.0, successors=after), lane]
+    return network(lanes)
+
+
+def obstacles_of(net, places, length):
+    """The obstacles of vehicles at (lane, s, v), in their order, `[N, K]`: who, and how far."""
+    lane_map, row = build_lane_map(net), lane_rows(net)
+    lane, s, v = zip(*places, strict=True)
+    lane = np.array([row[name] for name in lane])
+    state = start_state(
+        lane_map, drivers(len(lane)), shapes(len(lane), length), lane=jnp.asarray(lane), s=jnp.asarray(s),
+        v=jnp.asarray(v), goal=jnp.argmax(lane_map.routes.reachable[lane], -1),
+    )  # fmt: skip
+    return jax.jit(functools.partial(decide, CONFIG, Traffic()))(lane_map, state, Command())[1].obstacles
+
+
+def test_only_long_vehicles_wait_for_each_other_where_turns_pass_back_to_back():
+    one, two = (
+        arc(name, (x, 0.0), 9.0, at - 0.9, 1.8, junction="J")
+        for name, x, at in (("l", 0, 0), ("r", 21.4, np.pi))
+    )
+    net = approaches(one, two)
+    for length, waits in ((4.5, 0), (5.5, 0), (6.6, 1), (11.0, 1)):  # sqrt(1.1 m * 4 * 9 m) = 6.3 m
+        gap = obstacles_of(net, [("to_l", 37.0, 4.0), ("to_r", 36.0, 4.0)], length).gap
+        assert int((np.asarray(gap)[:, 3] < 1e5).sum()) == waits, length
+
+
+def test_a_queue_on_a_merge_does_not_hide_who_comes_behind_it():
+    into = {"junction": "J", "successors": ("out",)}
+    lanes = [
+        straight("a", (-160, 0), 0.0, 40.0, successors=("main",)),
+        straight("b", (-159, -9), 0.0, 40.0, successors=("ramp",)),
+        straight("main", (-120, 0), 0.0, 120.0, road="m", **into),
+        curve("ramp", (-119, -9), 0.0, (0, 0), 0.0, road="r", **into),
+        straight("out", (0, 0), 0.0, 99.0),
+    ]
+    net = network(lanes)
+    table = build_lane_map(net).conflicts
+    k = int(table.connector[lane_rows(net)["ramp"]])
+    s_in, s_out, f_in, f_out = (float(x[k, 0]) for x in (table.s_in, table.s_out, table.f_in, table.f_out))
+    assert f_out - f_in > 30
+    ahead = [("main", f_in + 6.5 + 6.5 * i, 4.0) for i in range(4)]
+    for last, waits in ((("main", f_in - 3.0, 7.0), True), (("out", 60.0, 7.0), False)):
+        found = obstacles_of(net, [("ramp", s_in - 0.3, 0.0), last, *ahead], 4.5)
+        assert (float(found.gap[0, 3]) < 5) == waits
+    # and the one that it follows is the last of them
+    assert int(found.other[0, 2]) == 2
+    assert float(found.gap[0, 2]) == pytest.approx(s_out - s_in + 0.3 - (f_out - f_in) + 2.0, abs=0.01)
+
+
+def test_who_ends_its_way_does_not_run_into_who_has_just_driven_on():
+    lanes = [straight("in", (0, 0), 0.0, 50.0, successors=("left", "right"))]
+    lanes += [curve(name, (50, 0), 0.0, (80, y), 0.0) for name, y in (("left", 12), ("right", -12))]
+    net = network(lanes)
+    for beyond, seen in ((1.0, True), (4.0, False)):
+        lane_map, row = build_lane_map(net, goals=[["in"], ["right"]]), lane_rows(net)
+        state = start_state(
+            lane_map, drivers(2), shapes(2, 4.0), lane=jnp.asarray([row["in"], row["right"]]),
+            s=jnp.asarray([35.0, 4.0 + beyond]), v=jnp.asarray([5.0, 0.0]), goal=jnp.asarray([0, 1]),
+        )  # fmt: skip
+        state = dataclasses.replace(state, previous=jnp.asarray([-1, row["in"]], state.previous.dtype))
+        found = decide(CONFIG, Traffic(), lane_map, state, Command())[1].obstacles
+        assert (int(found.other[0, 0]) == 1) == seen
+        assert not seen or float(found.gap[0, 0]) == pytest.approx(16.0)
 
 
 def test_fixed_programs_follow_the_clock():
@@ -202,6 +300,21 @@ def test_fixed_programs_follow_the_clock():
             CONFIG, lane_map, dataclasses.replace(state, step=jnp.int32(step)), nobody, 0.0 * nobody
         )
         np.testing.assert_array_equal(lights.phase, phase_at(lane_map.signals, step * 0.1))
+
+
+def test_lights_know_how_long_they_have_shown_what_they_show():
+    _, lane_map = bundled("intersection")
+    state = state_of("intersection", [0], [5.0], [5.0], [0])
+    jitted, nobody = jax.jit(functools.partial(switch, CONFIG, lane_map)), jnp.full((1, 1), -1)
+    since, before, longest = np.zeros(state.lights.phase.shape), np.asarray(state.lights.phase), 0
+    for k in range(300):
+        lights = jitted(dataclasses.replace(state, step=jnp.int32(5 * k)), nobody, 0.0 * nobody)
+        phase = np.asarray(lights.phase)
+        since = np.where((phase != before) | (k == 0), 0, since + 0.5)
+        np.testing.assert_allclose(lights.elapsed, since)
+        state, before = dataclasses.replace(state, lights=lights), phase
+        longest = max(longest, since[0])
+    assert 10 < longest < 60, "the lights of the map"
 
 
 def test_actuated_green_lasts_while_vehicles_come():

@@ -167,7 +167,10 @@ def test_loops_and_goals_on_the_way():
     got = column(net, [["r2_0"]])
     assert [got[f"r{i}_0"]["distance"] for i in range(4)] == [300, 200, 100, 400]
     assert got["r2_0"]["next"] is None
-    assert default_goals(net) == {f"r{i}_": (f"r{i}_0",) for i in range(4)}
+    goals = {f"r{i}_": (f"r{i}_0",) for i in range(4)}
+    assert default_goals(net) == goals
+    ends = [lane for i in range(4) for lane in road(f"r{i}_", [100, 60], {0: [f"r{(i + 1) % 4}_0"]})]
+    assert default_goals(network(ends)) == goals, "a lane that ends beside one that goes on is none"
 
 
 def test_default_goals_are_the_exits():

@@ -3,7 +3,8 @@
 Two lanes conflict where vehicles centred on them come too close: the distance between the centre
 lines is below `vehicle_width + margin`. The stretch of both lanes where that holds, its kind (cross,
 merge, diverge) and the priority between the two are rows of a `ConflictTable`, fixed-size arrays for
-the device. Everything here runs on the host in float64.
+the device. Where that holds nowhere, but long bodies in bends would touch, they sweep: a row that matters
+to those only. Everything here runs on the host in float64.
 """
 
 from __future__ import annotations
@@ -43,9 +44,13 @@ CLEARANCE = 3.5
 ABSENT = 1e6
 """Arc length (m) of an entry that is not there: far ahead of everything."""
 
+LONGEST = 12.0
+"""Length (m) of the longest body whose sweep is looked at."""
+
 _STEP = 0.25  # m, sampling of the centre lines
 _REACH = 200.0  # m, how far from a merge or split outside junctions two lanes are compared
 _STEP_ASIDE = 8.0  # m at the end of a lane that jumps aside to another one
+_BEND = 8.0  # m, over which the curvature that bodies sweep by is averaged
 _TOUCH = 0.05  # m, a stretch that starts or ends this close to an end of its lane reaches it
 
 
@@ -56,6 +61,7 @@ class ConflictType(enum.IntEnum):
     CROSS = 1
     MERGE = 2  # they end in the same lane
     DIVERGE = 3  # they start in the same lane
+    SWEEP = 4  # only the ends of bodies in bends meet: of those that are long enough
 
 
 @flax.struct.dataclass(kw_only=True)
@@ -87,6 +93,9 @@ class ConflictTable:
     type: Int[Array, "K C"]  # ConflictType
     prio: Int[Array, "K C"]  # +1 goes before the foe, 0 equal, -1 yields
     tie: Int[Array, "K C"]  # the same between equals that arrive together (right before left), else 0
+    # 1/m^2: two bodies of lengths l and l_foe meet in a sweep where l^2 sweep + l_foe^2 f_sweep > 1
+    sweep: Float[Array, "K C"]
+    f_sweep: Float[Array, "K C"]
 
     def pad(self, *, lanes: int, connectors: int, foes: int) -> ConflictTable:
         """The same table with these numbers of rows (null rows included) and slots.
@@ -124,6 +133,8 @@ class Overlap:
     f_in: float  # m, on the second
     f_out: float
     type: ConflictType
+    sweep: float = 0.0  # 1/m^2, as in `ConflictTable`
+    f_sweep: float = 0.0
 
     def mirrored(self) -> Overlap:
         """The same, seen from the second lane."""
@@ -135,6 +146,8 @@ class Overlap:
             f_in=self.s_in,
             f_out=self.s_out,
             type=self.type,
+            sweep=self.f_sweep,
+            f_sweep=self.sweep,
         )
 
 
@@ -176,7 +189,8 @@ def build_conflicts(
     share a successor or a predecessor. Outside junctions the 200 m next to the shared lane count.
     Lanes more than 3.5 m apart in elevation pass over each other.
 
-    Diverging paths need no priority. For the others the first rule that tells them apart decides:
+    Diverging paths need no priority, and those that sweep are equal. For the others the first rule that
+    tells them apart decides:
 
     1. what the file says (`Movement.yields_to`); where both yield to each other they are equal;
     2. control: priority before none or signal before yield, stop and all-way stop; zipper is equal;
@@ -194,7 +208,8 @@ def build_conflicts(
     index = {lane.id: k for k, lane in enumerate(lanes)}
     overlaps = find_overlaps(network, lanes, vehicle_width + margin)
     right_of_way = _RightOfWay(network, lanes)
-    decisions = [right_of_way.decide(overlap) for overlap in overlaps]
+    equal = _Decision(0, _Rule.NONE, 0)
+    decisions = [equal if o.type is ConflictType.SWEEP else right_of_way.decide(o) for o in overlaps]
     movement = np.array([right_of_way.only_movement(k) for k in range(len(lanes))] + [-1], np.int32)
     prio = np.array([d.prio for d in decisions], int)
     tie = np.array([d.tie for d in decisions], int)
@@ -210,6 +225,7 @@ def build_conflicts(
         entries[overlap.second].append((overlap.mirrored(), -p, -t))
     num, slots = len(lanes) + 1, max([0, *map(len, entries)])
     floats = {name: np.full((num, slots), ABSENT, np.float32) for name in ("s_in", "s_out", "f_in", "f_out")}
+    floats |= {name: np.zeros((num, slots), np.float32) for name in ("sweep", "f_sweep")}
     ints = {name: np.zeros((num, slots), np.int32) for name in ("foe", "type", "prio", "tie")}
     ints["foe"][:] = -1
     clear_s, cross_s = np.zeros(num, np.float32), np.zeros(num, np.float32)
@@ -224,7 +240,8 @@ def build_conflicts(
                 floats[name][k, c] = getattr(overlap, name)
             ints["foe"][k, c], ints["type"][k, c] = overlap.second, overlap.type
             ints["prio"][k, c], ints["tie"][k, c] = p, t
-        clear_s[k] = max([o.s_out for o, _, _ in row if o.type is not ConflictType.DIVERGE], default=0.0)
+        met = [o.s_out for o, _, _ in row if o.type in (ConflictType.CROSS, ConflictType.MERGE)]
+        clear_s[k] = max(met, default=0.0)
         cross_s[k] = max([o.s_out for o, _, _ in row if o.type is ConflictType.CROSS], default=0.0)
 
     connector = np.full(len(rows) + 1, -1, np.int32)
@@ -291,7 +308,8 @@ def find_overlaps(network: Network, lanes: Sequence[Lane], reach: float) -> list
         )
         for region, s in zip(regions, stretches.tolist(), strict=True)
     ]
-    return [*(found := _classify(network, lanes, overlaps)), *_merges_with_a_jump(lanes, found)]
+    found = _classify(network, lanes, overlaps)
+    return [*found, *_merges_with_a_jump(lanes, found), *_sweeps(lanes, curves, overlaps, reach)]
 
 
 def _merges_with_a_jump(lanes: Sequence[Lane], overlaps: Sequence[Overlap]) -> Iterator[Overlap]:
@@ -315,6 +333,43 @@ def _merges_with_a_jump(lanes: Sequence[Lane], overlaps: Sequence[Overlap]) -> I
                     f_out=ends[1][1],
                     type=ConflictType.MERGE,
                 )
+
+
+def _sweeps(
+    lanes: Sequence[Lane], curves: _Curves, overlaps: Sequence[Overlap], reach: float
+) -> Iterator[Overlap]:
+    """Lanes that keep clear of each other, but not of the ends of long bodies.
+
+    In a bend of curvature kappa these stand out by kappa l^2 / 8, for bodies that lie on the lane at their
+    centre, along it.
+    """
+    known = {(o.first, o.second) for o in overlaps}
+    most = math.pi / 8 * LONGEST  # m, two bodies together, each in a turn of 90 degrees
+    for a, b in _candidates(lanes, curves, reach + most):
+        first, second = curves.owner[a], curves.owner[b]
+        distance = curves.distance(a, b)
+        if (first, second) in known or distance.min() > reach + most:
+            continue
+        towards = curves.xyz[b][None, :, :2] - curves.xyz[a][:, None, :2]
+        towards /= np.maximum(distance, 1e-9)[..., None]
+        out = np.maximum(np.einsum("pqi,pi->pq", towards, curves.sweep(a)), 0)
+        f_out = np.maximum(-np.einsum("pqi,qi->pq", towards, curves.sweep(b)), 0)
+        near = distance - LONGEST**2 * (out + f_out) < reach
+        if not near.any():
+            continue
+        room = np.maximum(distance - reach, 1e-3)
+        p, q = np.nonzero(near)
+        yield Overlap(
+            first=first,
+            second=second,
+            s_in=float(curves.s[a][p.min()]),
+            s_out=float(curves.s[a][p.max()]),
+            f_in=float(curves.s[b][q.min()]),
+            f_out=float(curves.s[b][q.max()]),
+            type=ConflictType.SWEEP,
+            sweep=float((out / room)[near].max()),
+            f_sweep=float((f_out / room)[near].max()),
+        )
 
 
 def _sharing(lanes: Mapping[str, Lane], links: str) -> dict[str, list[Lane]]:
@@ -371,9 +426,16 @@ class _Curves:
         room = np.array([reach, reach, CLEARANCE])
         return ((self.low[a] <= self.high[b] + room) & (self.low[b] <= self.high[a] + room)).all(-1)
 
+    def sweep(self, a: int) -> Floats:
+        """kappa / 8 (1/m) to the outside of the bend, `[samples, 2]`: times l^2, how far ends stand out."""
+        s, xy = self.s[a], self.xyz[a][:, :2]
+        heading = np.unwrap(np.arctan2(*np.gradient(xy, axis=0).T[::-1]))
+        bend = np.interp(s + _BEND / 2, s, heading) - np.interp(s - _BEND / 2, s, heading)
+        return (bend / _BEND / 8)[:, None] * np.stack([np.sin(heading), -np.cos(heading)], -1)
+
     def regions(self, a: int, b: int, reach: float) -> list[_Region]:
         """Separate stretches where two curves are closer than `reach`."""
-        near = self._distance(a, b) < reach
+        near = self.distance(a, b) < reach
         p, q = np.flatnonzero(near.any(1)), np.flatnonzero(near.any(0))
         if not len(p):
             return []
@@ -386,7 +448,7 @@ class _Curves:
             found.append(_Region(a, b, *map(int, (p.min(), p.max(), q.min(), q.max()))))
         return found
 
-    def _distance(self, a: int, b: int) -> Floats:
+    def distance(self, a: int, b: int) -> Floats:
         """Distance in plan between all samples of two curves, infinite where one passes over."""
         distance = np.asarray(cdist(self.xyz[a][:, :2], self.xyz[b][:, :2]), np.float64)
         top, bottom = max(self.high[a, 2], self.high[b, 2]), min(self.low[a, 2], self.low[b, 2])

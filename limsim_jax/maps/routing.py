@@ -101,8 +101,8 @@ def default_goals(network: Network) -> dict[str, tuple[str, ...]]:
     """The ways out of a map: groups of lane ids by name.
 
     One goal per road and direction on which traffic leaves the map: the last lanes, none of which has
-    a drivable successor. (A lane that ends beside one that goes on is no exit.) A map without exits
-    (closed loops) has one goal per road and direction outside junctions instead: the last lanes on it.
+    a drivable successor. A map without exits (closed loops) has one goal per road and direction outside
+    junctions instead: the last lanes on it. A lane that ends beside one that goes on is neither.
     Names are road ids, with `+` or `-` for the sign of the lane numbers where a road has traffic both
     ways (OpenDRIVE).
     """
@@ -114,6 +114,7 @@ def default_goals(network: Network) -> dict[str, tuple[str, ...]]:
             lane
             for lane in lanes.values()
             if lane.junction is None
+            and (lane.successors or lane.carriageway not in go_on)
             and not any(lanes[x].road == lane.road for x in lane.successors if x in lanes)
         ]
     ways = {(lane.road, lane.number < 0) for lane in lanes.values()}

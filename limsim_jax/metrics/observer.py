@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, width
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.metrics.episode import EgoCarry, EgoMetrics, EgoStep
@@ -254,7 +255,7 @@ def _zones(lane_map: LaneMap, state: State, slot: Int[Array, ""], following: Int
     end = lane_map.length[ego]
     front = jnp.stack([state.s[slot] + end[0], state.s[slot], jnp.float32(-1)])  # m along each of the three
     row = table.connector[ego]  # the null row where there is none: stretches that are absent hold nobody
-    foe = table.foe[row]
+    foe = jnp.where(table.type[row] == ConflictType.SWEEP, -1, table.foe[row])  # paths that keep apart
     count = foe.shape[1]
     zone = jnp.where(foe >= 0, row[:, None] * count + jnp.arange(count)[None], -1)
 
@@ -272,7 +273,8 @@ def _zones(lane_map: LaneMap, state: State, slot: Int[Array, ""], following: Int
         at, front, length = (x[None, None] for x in (at, front, state.shape.length))
         theirs |= (lane == at) & inside(front, length, begin, end)
     theirs = (theirs & others[None, None]).any(-1)
-    return Zones(zone.ravel(), mine.ravel(), theirs.ravel())
+    there = zone >= 0
+    return Zones(zone.ravel(), (mine & there).ravel(), (theirs & there).ravel())
 
 
 def _meets_ego(

@@ -66,6 +66,7 @@ AT_END = 40.0
 _BEND_POINTS = 4  # places ahead on the own lane at which the bend is looked at
 _GENTLY, _FIRMLY = 2.5, 3.0  # m/s^2
 _IN_TIME = 0.9  # of the speed that would just do, as drivers come down to it by and by
+_LEFT = 2.0  # m beyond the end of a goal, within which who drives on is still in the way
 _WALL = 1.0  # m before the end of a lane that leads nowhere
 _WALL_ROOM = 25.0  # m before it, kept free to change lanes from a standstill
 
@@ -202,7 +203,7 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
 
 
 def _behind_tails(lane_map: LaneMap, state: State, ahead: Ahead, own: Pair) -> Pair:
-    """Leaders of those who come to the end of their way: also who has left its last lane but for the tail.
+    """Leaders of those who come to the end of their way: also who has just left its last lane.
 
     All others see those on their way, or in a split of the ways.
     """
@@ -210,7 +211,7 @@ def _behind_tails(lane_map: LaneMap, state: State, ahead: Ahead, own: Pair) -> P
     k = jnp.argmax(last, -1)[:, None]
     end, start = (jnp.take_along_axis(x, k, -1)[:, 0] for x in (ahead.lane, ahead.start))
     ends = last.any(-1)
-    lane, front = tails(lane_map, state)
+    lane, front = tails(lane_map, state, _LEFT)
     rear = front - state.shape.length[:, None]
     out = lane_map.length.shape[0]
     lane = jnp.where(lane == NO_LANE, out, lane)

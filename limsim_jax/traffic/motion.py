@@ -224,8 +224,12 @@ def lateral_speed(state: State) -> Float[Array, " N"]:
     return jnp.where(state.side != 0, -state.shift * slope * rate, 0)
 
 
-def tails(lane_map: LaneMap, state: State) -> tuple[Int[Array, "N 2"], Float[Array, "N 2"]]:
+def tails(
+    lane_map: LaneMap, state: State, beyond: float = 0.0
+) -> tuple[Int[Array, "N 2"], Float[Array, "N 2"]]:
     """Lanes behind its own on which a vehicle still has its tail, and its front bumper along them, m.
+
+    A tail so far `beyond` (m) the end of a lane counts as on it.
 
     NO_LANE where it has none. Lanes may be shorter than vehicles, so these are the lane behind and the one
     behind that; where several lead there, it is not known from which of them a vehicle came.
@@ -235,7 +239,7 @@ def tails(lane_map: LaneMap, state: State) -> tuple[Int[Array, "N 2"], Float[Arr
     lane = jnp.stack([state.previous, jnp.where(state.previous == NO_LANE, NO_LANE, behind)], -1)
     length = lane_map.length[lane]
     front = state.s[:, None] + jnp.cumsum(length, -1)
-    there = state.active[:, None] & (front - length < state.shape.length[:, None])
+    there = state.active[:, None] & (front - length < state.shape.length[:, None] + beyond)
     return jnp.where(there, lane, NO_LANE), front
 
 

@@ -272,12 +272,19 @@ def _meet(
     splits, merges = (kind == ConflictType.DIVERGE)[None], (kind == ConflictType.MERGE)[None]
     me = computed_once(_Sight(*(x.ravel()[row][None] for x in sight)))
     level = me.y - s_in + f_in  # on the foe; splits begin together, or one way goes on over several lanes
-    wanted = shelf.key(foe, share(foe, jnp.where(splits, level, f_out)[0]))
+    # of those who queue on a merge the last one ahead hides the others, not those who come after it
+    abreast = jnp.clip(me.y - s_out + f_out, f_in, f_out)
+    wanted = shelf.key(foe, share(foe, jnp.where(splits, level, jnp.where(merges, abreast, f_out))[0]))
+    first = computed_once(shelf.first_from(order, wanted))
+    at = entry[jnp.clip(first, 0, count - 1)]
+    ahead = (first < count) & (connector[at] == foe) & (entries.y[at] - entries.length[at] < f_out[0])
     q = jnp.arange(_FOES)[:, None]
-    place = computed_once(shelf.first_from(order, wanted))[None] + jnp.where(splits, q - 1, -1 - q)
+    place = first[None] + jnp.where(splits, q - 1, ahead.astype(jnp.int32)[None] - 1 - q)
     index = computed_once(entry[jnp.clip(place, 0, count - 1)])  # [Q, P]
     there = (place >= 0) & (place < count) & (connector[index] == foe[None]) & exists[None]
     other = computed_once(_Sight(*(x[index] for x in entries)))
+    long = me.length**2 * table.sweep[k, c][None] + other.length**2 * table.f_sweep[k, c][None] > 1
+    there &= (kind != ConflictType.SWEEP)[None] | long
     there = computed_once(there & (other.slot != me.slot))
 
     mine, theirs = _Way(s_in, s_out), _Way(f_in, f_out)
@@ -477,11 +484,12 @@ def _lights(
     light = shows[rows.lane]
     brake = state.v * state.v
     line = jnp.maximum(rows.line, 0)
-    # at yellow a driver decides once: what counts is how far the line was when it began
-    then = line + state.v[:, None] * since
+    # at yellow a driver decides once: what counts is how fast it was, and how far the line, when it began
+    v_then = state.v[:, None] + jnp.maximum(-state.a, 0)[:, None] * since
+    then = line + (state.v[:, None] + v_then) / 2 * since
     # who slows down for a turn comes too late even if it is near
-    late = 2 * then > _YELLOW * (state.v[:, None] + speed)
-    could = brake[:, None] <= 2 * jnp.where(late, 1.5 * YELLOW_BRAKE, YELLOW_BRAKE) * then
+    late = 2 * then > _YELLOW * (v_then + speed)
+    could = v_then * v_then <= 2 * jnp.where(late, 1.5 * YELLOW_BRAKE, YELLOW_BRAKE) * then
     # who has begun to brake, but comes down late, goes on braking
     brakes = (state.a < -_SLOWS)[:, None] & (brake[:, None] <= 2 * state.driver.b[:, None] * line)
     at_yellow = light == SignalState.YELLOW
@@ -494,7 +502,7 @@ def _lights(
     stops = (yellow | red) & (rows.x < 0) & (rows.line > -NO_GAP / 2) & (rows.connector >= 0)
     minor = (light == SignalState.GREEN_MINOR) | (light == SignalState.STOP)
     major = jnp.where(light == SignalState.GREEN_MAJOR, 1, jnp.where(minor, -1, 0))
-    left_over = (rows.line < -_MARGIN) & (at_red | at_yellow)  # clears the junction first
+    left_over = (rows.line < -_MARGIN) & at_red  # clears the junction first; at yellow who stops lets it
     stop = jnp.where(stops, jnp.maximum(rows.line - _MARGIN, -_MARGIN), NO_GAP)
     return stop, jnp.where(left_over, 2, major)
 

@@ -54,8 +54,9 @@ def switch(
     over = jnp.where(extends, (elapsed >= shortest) & ((gap > GAP) | (elapsed >= longest)), elapsed >= usual)
     after = jnp.where(over, table.next_phase[row, now], now)
     actuated = table.actuated & ~start
+    new = jnp.where(actuated, after, phase)
     return Lights(
-        phase=jnp.where(actuated, after, phase),
-        elapsed=jnp.where(actuated & ~over, elapsed, 0),
+        phase=new,
+        elapsed=jnp.where(start | jnp.where(actuated, over, new != now), 0, elapsed),
         gap=jnp.where(actuated & ~over, gap, 0),
     )
