@@ -179,8 +179,11 @@ def test_yellow_is_a_dilemma_that_the_braking_decides():
 
     then = line + v * since
     late = 2 * then > 2.5 * (v + 20)
-    np.testing.assert_array_equal(stops(SignalState.YELLOW), v * v / (2 * then) <= np.where(late, 4.5, 3.0))
+    could = v * v / (2 * then) <= np.where(late, 4.5, 3.0)
     needed = v * v / (2 * line)
+    # who has come so near without braking for the light drives on
+    np.testing.assert_array_equal(stops(SignalState.YELLOW), could & (needed <= 5.0))
+    assert (could & (needed > 5.0)).any()
     np.testing.assert_array_equal(stops(SignalState.RED), needed <= 0.9 * 8)
     assert not stops(SignalState.GREEN_MAJOR).any() and not stops(SignalState.OFF).any()
     assert stops(SignalState.RED_YELLOW)[v < 4].any()
@@ -191,7 +194,7 @@ def test_yellow_is_a_dilemma_that_the_braking_decides():
     v_then = v + 1.5 * since
     then = line + (v + v_then) / 2 * since
     late = 2 * then > 2.5 * (v_then + 20)
-    could = v_then**2 / (2 * then) <= np.where(late, 4.5, 3.0)
+    could = (v_then**2 / (2 * then) <= np.where(late, 4.5, 3.0)) & (needed <= 5.0)
     np.testing.assert_array_equal(stops(SignalState.YELLOW, braking), could | (needed <= b))
     assert (could & (needed > b)).any() and (~could & (needed <= b)).any()
     # who clears the junction goes before who has green from the side, but not before who still comes

@@ -60,6 +60,7 @@ _PAIRS = 2  # conflicts that are looked at, per slot; more at once make vehicles
 _EASY = 2.0  # m/s^2, braking from which conflicts ahead matter
 _MARGIN = 0.5  # m between the front bumper and what it waits at
 _YELLOW = 2.5  # s of yellow that are counted on
+_YELLOW_HARD = 5.0  # m/s^2, more than what who stops at yellow comes to
 _OVER_LINE = 2.0  # m beyond the line at which a vehicle that rolls may still stop
 _SLOWS = 1.0  # m/s^2, braking of who may stop inside a junction
 _STANDS = 1.0  # m/s, below which the vehicle ahead counts as standing
@@ -490,6 +491,8 @@ def _lights(
     # who slows down for a turn comes too late even if it is near
     late = 2 * then > _YELLOW * (v_then + speed)
     could = v_then * v_then <= 2 * jnp.where(late, 1.5 * YELLOW_BRAKE, YELLOW_BRAKE) * then
+    # nobody who has come down for something else, as a bend, brakes hard at the last moment
+    could &= brake[:, None] <= 2 * _YELLOW_HARD * line
     # who has begun to brake, but comes down late, goes on braking
     brakes = (state.a < -_SLOWS)[:, None] & (brake[:, None] <= 2 * state.driver.b[:, None] * line)
     at_yellow = light == SignalState.YELLOW
