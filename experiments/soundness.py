@@ -34,10 +34,7 @@ from limsim_jax.types import Config, State, Status
 
 RESULTS = Path(__file__).parent / "results"
 
-RATES = {
-    "highway": 2000.0, "ramp": 900.0, "intersection": 400.0, "roundabout": 400.0, "long_route": 250.0,
-    "carla_legacy_town02": 100.0,
-}  # fmt: skip
+RATES = {"highway": 2000.0, "ramp": 900.0, "intersection": 400.0, "roundabout": 400.0, "long_route": 250.0}
 """veh/h per origin; other maps: `OTHER_RATE`."""
 
 OTHER_RATE = 200.0
@@ -253,7 +250,7 @@ def main() -> None:
     rows = {row["map"]: row for row in json.loads(file.read_text())["maps"]} if file.exists() else {}
     for name in options.map:
         stem = Path(name).stem
-        rate = options.rate or RATES.get(stem, OTHER_RATE)
+        rate = options.rate or RATES.get(name, OTHER_RATE)
         path, bundled = bundled_maps().get(name) or name, name in bundled_maps()
         count = options.episodes if bundled else options.town_episodes
         slots, initial = (SLOTS.get(name, 64), INITIAL) if bundled else (128, IN_TOWN.get(stem, 50))
