@@ -189,7 +189,7 @@ def test_ends_of_long_bodies_meet_where_turns_pass_back_to_back():
     net = network([one, two])
     assert not entries(net)
     found = sweeps(net)
-    room = apart - REACH
+    room = apart - VEHICLE_WIDTH
     assert found["one", "two"] == pytest.approx((1 / (8 * r * room), 1 / (8 * other * room)), rel=0.01)
     assert found["two", "one"] == found["one", "two"][::-1]
     table = build_conflicts(net, rows(net))
@@ -202,7 +202,7 @@ def test_ends_of_long_bodies_meet_where_turns_pass_back_to_back():
 def test_of_turns_side_by_side_only_the_inner_one_sweeps():
     inner, outer = (arc(name, (0, 0), r, 0.0, 1.5, junction="J") for name, r in (("in", 7.0), ("out", 10.0)))
     sweep, f_sweep = sweeps(network([inner, outer]))["in", "out"]
-    assert sweep == pytest.approx(1 / (8 * 7.0 * (3.0 - REACH)), rel=0.02) and f_sweep == 0
+    assert sweep == pytest.approx(1 / (8 * 7.0 * (3.0 - VEHICLE_WIDTH)), rel=0.02) and f_sweep == 0
     ahead = [straight(name, (0.0, y), 0.0, 20.0, junction="J") for name, y in (("a", 0.0), ("b", 2.6))]
     assert not sweeps(network(ahead))
 

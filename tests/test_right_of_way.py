@@ -250,7 +250,7 @@ def test_only_long_vehicles_wait_for_each_other_where_turns_pass_back_to_back():
         for name, x, at in (("l", 0, 0), ("r", 21.4, np.pi))
     )
     net = approaches(one, two)
-    for length, waits in ((4.5, 0), (5.5, 0), (6.6, 1), (11.0, 1)):  # sqrt(1.1 m * 4 * 9 m) = 6.3 m
+    for length, waits in ((4.5, 0), (6.8, 0), (7.4, 1), (11.0, 1)):  # sqrt(1.4 m * 4 * 9 m) = 7.1 m
         gap = obstacles_of(net, [("to_l", 37.0, 4.0), ("to_r", 36.0, 4.0)], length).gap
         assert int((np.asarray(gap)[:, 3] < 1e5).sum()) == waits, length
 

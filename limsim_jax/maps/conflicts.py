@@ -50,7 +50,7 @@ LONGEST = 12.0
 _STEP = 0.25  # m, sampling of the centre lines
 _REACH = 200.0  # m, how far from a merge or split outside junctions two lanes are compared
 _STEP_ASIDE = 8.0  # m at the end of a lane that jumps aside to another one
-_BEND = 8.0  # m, over which the curvature that bodies sweep by is averaged
+_BEND = 5.0  # m, over which the curvature that bodies sweep by is averaged: that of a car
 _TOUCH = 0.05  # m, a stretch that starts or ends this close to an end of its lane reaches it
 
 
@@ -206,7 +206,7 @@ def build_conflicts(
     """
     lanes = connectors(network)
     index = {lane.id: k for k, lane in enumerate(lanes)}
-    overlaps = find_overlaps(network, lanes, vehicle_width + margin)
+    overlaps = find_overlaps(network, lanes, vehicle_width, margin)
     right_of_way = _RightOfWay(network, lanes)
     equal = _Decision(0, _Rule.NONE, 0)
     decisions = [equal if o.type is ConflictType.SWEEP else right_of_way.decide(o) for o in overlaps]
@@ -285,13 +285,13 @@ def priority_cycles(table: ConflictTable) -> list[list[int]]:
     return cycles
 
 
-def find_overlaps(network: Network, lanes: Sequence[Lane], reach: float) -> list[Overlap]:
-    """All stretches where centre lines of `lanes` come closer than `reach` (m), each pair once.
+def find_overlaps(network: Network, lanes: Sequence[Lane], width: float, margin: float) -> list[Overlap]:
+    """All stretches where centre lines of `lanes` come closer than `width` and `margin` (m), each pair once.
 
     `first` and `second` are positions in `lanes`, first < second. Ends are exact to about 1 cm for
     paths that cross at more than 30 degrees; at flat angles the closeness itself is exact to 5 mm.
     """
-    curves = _Curves(lanes)
+    curves, reach = _Curves(lanes), width + margin
     regions = []
     for a, b in _candidates(lanes, curves, reach):
         regions.extend(curves.regions(a, b, reach))
@@ -309,7 +309,7 @@ def find_overlaps(network: Network, lanes: Sequence[Lane], reach: float) -> list
         for region, s in zip(regions, stretches.tolist(), strict=True)
     ]
     found = _classify(network, lanes, overlaps)
-    return [*found, *_merges_with_a_jump(lanes, found), *_sweeps(lanes, curves, overlaps, reach)]
+    return [*found, *_merges_with_a_jump(lanes, found), *_sweeps(lanes, curves, overlaps, width)]
 
 
 def _merges_with_a_jump(lanes: Sequence[Lane], overlaps: Sequence[Overlap]) -> Iterator[Overlap]:
@@ -336,40 +336,51 @@ def _merges_with_a_jump(lanes: Sequence[Lane], overlaps: Sequence[Overlap]) -> I
 
 
 def _sweeps(
-    lanes: Sequence[Lane], curves: _Curves, overlaps: Sequence[Overlap], reach: float
+    lanes: Sequence[Lane], curves: _Curves, overlaps: Sequence[Overlap], width: float
 ) -> Iterator[Overlap]:
     """Lanes that keep clear of each other, but not of the ends of long bodies.
 
     In a bend of curvature kappa these stand out by kappa l^2 / 8, for bodies that lie on the lane at their
-    centre, along it.
+    centre, along it. Bodies of `LONGEST` meet while both centres are within the stretch: that much of it is
+    left at its ends for fronts and rears.
     """
     known = {(o.first, o.second) for o in overlaps}
     most = math.pi / 8 * LONGEST  # m, two bodies together, each in a turn of 90 degrees
-    for a, b in _candidates(lanes, curves, reach + most):
+    for a, b in _candidates(lanes, curves, width + most):
         first, second = curves.owner[a], curves.owner[b]
         distance = curves.distance(a, b)
-        if (first, second) in known or distance.min() > reach + most:
+        if (first, second) in known or distance.min() > width + most:
             continue
         towards = curves.xyz[b][None, :, :2] - curves.xyz[a][:, None, :2]
         towards /= np.maximum(distance, 1e-9)[..., None]
         out = np.maximum(np.einsum("pqi,pi->pq", towards, curves.sweep(a)), 0)
         f_out = np.maximum(-np.einsum("pqi,qi->pq", towards, curves.sweep(b)), 0)
-        near = distance - LONGEST**2 * (out + f_out) < reach
+        room = np.maximum(distance - width, 1e-3)
+        near = LONGEST**2 * (out + f_out) > room
         if not near.any():
             continue
-        room = np.maximum(distance - reach, 1e-3)
-        p, q = np.nonzero(near)
+        meet = np.unravel_index(np.argmax((out + f_out) / room), room.shape)  # of equal bodies, the shortest
+        (s_in, s_out), (f_in, f_end) = (
+            _between_ends(curves.s[c][x.min()], curves.s[c][x.max()])
+            for c, x in zip((a, b), np.nonzero(near), strict=True)
+        )
         yield Overlap(
             first=first,
             second=second,
-            s_in=float(curves.s[a][p.min()]),
-            s_out=float(curves.s[a][p.max()]),
-            f_in=float(curves.s[b][q.min()]),
-            f_out=float(curves.s[b][q.max()]),
+            s_in=s_in,
+            s_out=s_out,
+            f_in=f_in,
+            f_out=f_end,
             type=ConflictType.SWEEP,
-            sweep=float((out / room)[near].max()),
-            f_sweep=float((f_out / room)[near].max()),
+            sweep=float(out[meet] / room[meet]),
+            f_sweep=float(f_out[meet] / room[meet]),
         )
+
+
+def _between_ends(begin: float, end: float) -> tuple[float, float]:
+    """Where fronts enter and rears leave a stretch (m) that holds for the centres of bodies of `LONGEST`."""
+    middle, half = (begin + end) / 2, max((end - begin - LONGEST) / 2, 0.5)
+    return float(middle - half), float(middle + half)
 
 
 def _sharing(lanes: Mapping[str, Lane], links: str) -> dict[str, list[Lane]]:
