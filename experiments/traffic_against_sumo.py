@@ -738,7 +738,8 @@ pasubio_tls.add.xml and every fourth vehicle.
 - SUMO looks for collisions along lanes. Ours compares bodies, so it also finds those who touch beside
   one another where lanes come close: side by side on the two lanes of 1200363973 in ingolstadt1, which are
   led 3 m sideways within 8 m, and where vehicles of 12 m turn beside others (4_6 and 29_0 of
-  bologna_pasubio).
+  bologna_pasubio). Whom the bodies leave no room goes one after the other there: queues on 1200363973
+  discharge slower than on lanes that drivers share.
 - Vehicles that stand for 300 s are teleported by SUMO. Ours stay, and hold up all behind them.
 """
 
