@@ -361,7 +361,7 @@ def _sweeps(
             continue
         meet = np.unravel_index(np.argmax((out + f_out) / room), room.shape)  # of equal bodies, the shortest
         (s_in, s_out), (f_in, f_end) = (
-            _between_ends(curves.s[c][x.min()], curves.s[c][x.max()])
+            _between_ends(float(curves.s[c][x.min()]), float(curves.s[c][x.max()]))
             for c, x in zip((a, b), np.nonzero(near), strict=True)
         )
         yield Overlap(
@@ -380,7 +380,7 @@ def _sweeps(
 def _between_ends(begin: float, end: float) -> tuple[float, float]:
     """Where fronts enter and rears leave a stretch (m) that holds for the centres of bodies of `LONGEST`."""
     middle, half = (begin + end) / 2, max((end - begin - LONGEST) / 2, 0.5)
-    return float(middle - half), float(middle + half)
+    return middle - half, middle + half
 
 
 def _sharing(lanes: Mapping[str, Lane], links: str) -> dict[str, list[Lane]]:
