@@ -361,8 +361,7 @@ def _sweeps(
             continue
         meet = np.unravel_index(np.argmax((out + f_out) / room), room.shape)  # of equal bodies, the shortest
         (s_in, s_out), (f_in, f_end) = (
-            _between_ends(float(curves.s[c][x.min()]), float(curves.s[c][x.max()]))
-            for c, x in zip((a, b), np.nonzero(near), strict=True)
+            _between_ends(curves.s[c], x) for c, x in zip((a, b), np.nonzero(near), strict=True)
         )
         yield Overlap(
             first=first,
@@ -377,10 +376,11 @@ def _sweeps(
         )
 
 
-def _between_ends(begin: float, end: float) -> tuple[float, float]:
-    """Where fronts enter and rears leave a stretch (m) that holds for the centres of bodies of `LONGEST`."""
+def _between_ends(s: Floats, meet: NDArray[np.intp]) -> tuple[float, float]:
+    """Where fronts enter and rears leave, of bodies of `LONGEST` that meet with centres at these samples."""
+    begin, end = float(s[meet.min()]), float(s[meet.max()])
     middle, half = (begin + end) / 2, max((end - begin - LONGEST) / 2, 0.5)
-    return middle - half, middle + half
+    return max(middle - half, float(s[0])), min(middle + half, float(s[-1]))
 
 
 def _sharing(lanes: Mapping[str, Lane], links: str) -> dict[str, list[Lane]]:
