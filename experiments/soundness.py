@@ -43,7 +43,8 @@ SLOTS = {"highway": 128, "ramp": 128, "long_route": 128}
 
 SHARED = Path(os.environ.get("LIMSIM_SHARED_DATA", Path(__file__).parents[2] / "shared" / "data"))
 TOWNS = sorted((SHARED / "opendrive").glob("carla_*.xodr"))
-INITIAL, IN_TOWN = 20, {"carla_legacy_town02": 25}  # vehicles at the start, about; towns not named: 50
+INITIAL, IN_TOWN = 20, 50  # vehicles at the start, about
+IN_SMALL_TOWN = {"carla_legacy_town02": 25}  # a grid of single lanes, 5.7 km of them
 HORIZON = 180.0  # s
 RANK = np.zeros(len(SignalState), np.int32)  # by what a light shows; who is inside at red clears first
 RANK[[SignalState.RED, SignalState.YELLOW, SignalState.RED_YELLOW]] = 2
@@ -249,11 +250,11 @@ def main() -> None:
     file = RESULTS / f"{options.out}.json"
     rows = {row["map"]: row for row in json.loads(file.read_text())["maps"]} if file.exists() else {}
     for name in options.map:
-        stem = Path(name).stem
         rate = options.rate or RATES.get(name, OTHER_RATE)
         path, bundled = bundled_maps().get(name) or name, name in bundled_maps()
         count = options.episodes if bundled else options.town_episodes
-        slots, initial = (SLOTS.get(name, 64), INITIAL) if bundled else (128, IN_TOWN.get(stem, 50))
+        in_town = IN_SMALL_TOWN.get(Path(name).stem, IN_TOWN)
+        slots, initial = (SLOTS.get(name, 64), INITIAL) if bundled else (128, in_town)
         row = episodes(path, rate, count, slots=slots, chunk=options.chunk, initial=initial)
         rows[row["map"]] = row
         print(json.dumps(row), flush=True)

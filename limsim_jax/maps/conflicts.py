@@ -348,31 +348,34 @@ def _sweeps(
     most = math.pi / 8 * LONGEST  # m, two bodies together, each in a turn of 90 degrees
     for a, b in _candidates(lanes, curves, width + most):
         first, second = curves.owner[a], curves.owner[b]
+        if (first, second) in known:
+            continue
         distance = curves.distance(a, b)
-        if (first, second) in known or distance.min() > width + most:
+        if distance.min() > width + most:
             continue
         towards = curves.xyz[b][None, :, :2] - curves.xyz[a][:, None, :2]
         towards /= np.maximum(distance, 1e-9)[..., None]
         out = np.maximum(np.einsum("pqi,pi->pq", towards, curves.sweep(a)), 0)
-        f_out = np.maximum(-np.einsum("pqi,qi->pq", towards, curves.sweep(b)), 0)
+        out_foe = np.maximum(-np.einsum("pqi,qi->pq", towards, curves.sweep(b)), 0)
         room = np.maximum(distance - width, 1e-3)
-        near = LONGEST**2 * (out + f_out) > room
+        near = LONGEST**2 * (out + out_foe) > room
         if not near.any():
             continue
-        meet = np.unravel_index(np.argmax((out + f_out) / room), room.shape)  # of equal bodies, the shortest
-        (s_in, s_out), (f_in, f_end) = (
-            _between_ends(curves.s[c], x) for c, x in zip((a, b), np.nonzero(near), strict=True)
-        )
+        p, q = np.nonzero(near)
+        s_in, s_out = _between_ends(curves.s[a], p)
+        f_in, f_out = _between_ends(curves.s[b], q)
+        # where the shortest of equal bodies meet
+        meet = np.unravel_index(np.argmax((out + out_foe) / room), room.shape)
         yield Overlap(
             first=first,
             second=second,
             s_in=s_in,
             s_out=s_out,
             f_in=f_in,
-            f_out=f_end,
+            f_out=f_out,
             type=ConflictType.SWEEP,
             sweep=float(out[meet] / room[meet]),
-            f_sweep=float(f_out[meet] / room[meet]),
+            f_sweep=float(out_foe[meet] / room[meet]),
         )
 
 
