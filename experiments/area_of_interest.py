@@ -34,7 +34,7 @@ SLOTS = 40
 EVERYWHERE = 1e6
 """m"""
 
-AREAS = ((8, 50.0), (16, 50.0), (SLOTS, EVERYWHERE))
+AREAS = ((2, 15.0), (4, 25.0), (8, 50.0), (16, 50.0), (SLOTS, EVERYWHERE))
 """Vehicles planned for beside the ego, and the radius in m within which."""
 
 

@@ -245,7 +245,7 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
         (success, low, high), (score, least, most) = ([100 * x for x in r["success"]], r["score"])
         fault, _, bound = (100 * x for x in r["at_fault_contacts"])
         theirs = f" ({PAPER[r['scenario']]})" if r["policy"] == "limsim_tm" else ""
-        took = "".join(f" {r[name]:.3g} |" if name in r else " not measured |" for name in times)
+        took = "".join(f" {r[name]:.2g} |" if name in r else " |" for name in times)
         rows.append(
             f"| {r['scenario']} | {r['policy']} | {r['seeds']:,} | {success:.1f} [{low:.1f}, {high:.1f}] "
             f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}]{theirs} "

@@ -134,6 +134,31 @@ def test_who_is_planned_for_knows_what_the_others_chose():
     assert replace(policy, shares=False).init(config, lane_map, state).plan is None
 
 
+def test_a_change_that_can_wait_does_not_begin_shortly_before_a_junction():
+    """Else one stands between two lanes at the entry of a roundabout, half in the way of those beside."""
+    network, lane_map = bundled("long_route")
+    routes, (goal, lane) = lane_map.routes, (2, lane_rows(network)["7_0_-3"])
+    length = float(lane_map.length[lane])
+    assert (
+        int(routes.lanes_to_go[lane, goal]) == 2 and float(routes.change_distance[lane, goal]) > length + 100
+    )
+    # with `forced`, there is nothing behind the junction: the change has to be made here
+    forced = replace(
+        lane_map, routes=replace(routes, change_distance=jnp.minimum(routes.change_distance, length))
+    )
+    state = state_of("long_route", [lane] * 2, [20.0, length - 10.0], [7.0, 7.0], [goal] * 2)
+    egos = from_lane(lane_map, state, boxes(lane_map, state), [0, 1], True)
+    state, config, policy = replace(state, egos=egos), Config(dt=0.1), LimSimTM(search=None)
+
+    @jax.jit
+    def decide(lane_map):
+        memory = policy.init(config, lane_map, state)
+        return policy(config, lane_map, state, memory, jax.random.key(0))[1].side
+
+    np.testing.assert_array_equal(decide(lane_map), [1, 0])
+    np.testing.assert_array_equal(decide(forced), [1, 1])
+
+
 def test_each_module_has_a_reference():
     policy = LimSimTM(others=2, search_every=2)
     found = variants(policy, straight)

@@ -148,11 +148,13 @@ class LimSimTM:
         begins &= look == jnp.where((state.step // config.decision_every) % 2 == 0, 1, -1)
         most = jnp.where(need * look > 0, 2.5 + 2.5 * press, 2.0)
         fits = self._fits(state, slot, traffic, most, 0.3 - 0.2 * press)
-        # nobody changes lanes for speed alone shortly before a junction
+        begins &= ((wish == look) | (need * look > 0)) & fits | ((rule == look) & (need * rule > 0))
+        # what can wait does not begin shortly before a junction: it would stand between two lanes there
         v = jnp.maximum(state.v[slot], CREEP_SPEED)
         to_junction = lane_map.length[lane] - s - v * state.driver.lane_change_time[slot] - _BEFORE_JUNCTION
-        fits &= (need * look > 0) | (to_junction > 0) | ~lane_map.is_connector[own.lane].any(-1)
-        begins &= ((wish == look) | (need * look > 0)) & fits | ((rule == look) & (need * rule > 0))
+        here = lane_map.routes.change_distance[lane, goal] <= lane_map.length[lane]  # not behind the junction
+        near = (to_junction <= 0) & lane_map.is_connector[own.lane].any(-1)
+        begins &= ~near | ((need * look > 0) & here)
         goes_on = (side != 0) & self._fits(state, slot, traffic, _HARD, 0.0)
         side = jnp.where(there & (begins | goes_on), look, 0)
         changes = side != 0
