@@ -1,6 +1,6 @@
 """What the Area of Interest costs and what is lost as it shrinks, against planning for everybody.
 
-    python experiments/area_of_interest.py [--seeds 24] [--scenario roundabout]
+    python experiments/area_of_interest.py [--seeds 32] [--scenario roundabout]
 
 LimSim-TM drives the ego of the scenario, and more or fewer of the vehicles around it. Cost is the CPU time
 of the run alone, without compiling. Fidelity is how far the outcomes over seeds are from those where
@@ -59,7 +59,7 @@ def outcomes(experiment: Experiment, seeds: range, chunk: int) -> tuple[dict[str
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=24)
+    parser.add_argument("--seeds", type=int, default=32)
     parser.add_argument("--scenario", default="roundabout", choices=list(PAPER))
     options = parser.parse_args()
     use_all_cores()
