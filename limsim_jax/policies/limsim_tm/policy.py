@@ -151,10 +151,10 @@ class LimSimTM:
         begins &= ((wish == look) | (need * look > 0)) & fits | ((rule == look) & (need * rule > 0))
         # what can wait does not begin shortly before a junction: it would stand between two lanes there
         v = jnp.maximum(state.v[slot], CREEP_SPEED)
-        to_junction = lane_map.length[lane] - s - v * state.driver.lane_change_time[slot] - _BEFORE_JUNCTION
-        here = lane_map.routes.change_distance[lane, goal] <= lane_map.length[lane]  # not behind the junction
-        near = (to_junction <= 0) & lane_map.is_connector[own.lane].any(-1)
-        begins &= ~near | ((need * look > 0) & here)
+        inside = lane_map.is_connector[own.lane]  # along the way: roads may be in pieces before it
+        junction = jnp.where(inside.any(-1), _STEP * jnp.argmax(inside, -1).astype(s.dtype), jnp.inf)
+        near = junction <= v * state.driver.lane_change_time[slot] + _BEFORE_JUNCTION
+        begins &= ~near | ((need * look > 0) & (room <= junction + _STEP))
         goes_on = (side != 0) & self._fits(state, slot, traffic, _HARD, 0.0)
         side = jnp.where(there & (begins | goes_on), look, 0)
         changes = side != 0
