@@ -224,7 +224,10 @@ class Rollout:
         if not self._free:
             egos = replace(egos, free=jnp.zeros_like(egos.free))
         state = replace(state, egos=egos)
-        memory = self.policy.init(self.config, lane_map, state)
+        return self.anew(lane_map, state, self.policy.init(self.config, lane_map, state))
+
+    def anew(self, lane_map: LaneMap, state: State, memory: Any) -> Carry:
+        """Before a decision of a world that runs already: totals and metrics begin here."""
         measured = None if self.measure is None else self.measure.init(self.config, lane_map, state)
         return mapped_like(state.s, Carry(state, memory, no_totals(state), measured))
 

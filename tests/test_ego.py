@@ -605,6 +605,23 @@ def test_tracking_circles_and_lane_changes(lag, bound):
     assert np.linalg.norm(there - goal, axis=-1)[30:].max() < 0.25, "at the right time, too"
 
 
+def test_who_creeps_keeps_the_wheels_turned():
+    """Circles of 12 m to both sides; a trajectory that does not move says nothing about the wheels."""
+    v = [0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.2, 0.4]
+    state = free_world("roundabout", [0], [40.0], v)
+    radii = np.array([12.0, -12.0, 12.0, -12.0, 12.0, -12.0, -12.0, 12.0])
+    wheels = np.arctan(2 * np.tan(np.arcsin(WHEELBASE / 2 / radii)))
+    turned = jnp.asarray(np.where(np.arange(N) < 6, wheels, 0.0), jnp.float32)  # 6 and 7 begin straight
+    paths = [circle(state, k, radii[k], v[k]) for k in range(N)]
+    e = state.egos
+    body = e.heading - jnp.asarray(
+        np.arcsin(WHEELBASE / 2 / radii), jnp.float32
+    )  # the centre moves along them
+    state = dataclasses.replace(state, egos=dataclasses.replace(e, steering=turned, heading=body))
+    _, trace = run(follow, "roundabout", Limits(), state, trajectory_of(*paths))
+    np.testing.assert_allclose(trace["steering"][-1], wheels, atol=0.02)
+
+
 def test_tracking_keeps_to_the_path_when_it_is_late():
     """An ego that cannot drive as fast as it should is half a circle late, and still on the circle."""
     state = free_world("roundabout", [0], [40.0], [3.0])

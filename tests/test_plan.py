@@ -140,6 +140,19 @@ def test_what_is_chosen_keeps_its_bounds(d, slope):
     np.testing.assert_allclose(np.cos(course - (heading[:, 1:] + heading[:, :-1]) / 2), 1, atol=2e-3)
 
 
+@pytest.mark.parametrize(
+    "bend, d, slope", [(0.0, -1.0, -0.14), (0.0, -0.9, -0.2), (-0.14, 0.4, 0.17), (-0.14, 0.5, 0.32)]
+)
+def test_who_stands_askew_turns_the_wheels_and_drives_on(bend, d, slope):
+    """With the right corner over the edge, or straight on in a bend nearly as tight as the wheels allow."""
+    case = task((bend, -bend), v=0.0, d=np.array([d, 0.0]), slope=np.array([slope, 0.0]))
+    start = case.start._replace(bend=jnp.asarray([-bend, 0.0], jnp.float32))  # the wheels are straight
+    chosen = planned(case._replace(start=start))
+    assert chosen.safe.all()
+    went = np.hypot(*(np.diff(np.asarray(x)[:, [0, -1]])[:, 0] for x in (chosen.x, chosen.y)))
+    assert (went > 3.0).all(), "standing breaks no bound, and would be for ever"
+
+
 def test_envelope_slows_for_bends_limits_and_walls():
     case = task(bends=(0.0, 0.05), wall=np.array([60.0, NO_GAP]))
     envelope = np.asarray(speed_envelope(case))

@@ -452,6 +452,7 @@ _LOOK = 0.8  # s: the lateral error fades with v * _LOOK m as its length scale .
 _LEAST_LOOK = 3.0  # m: ... but no less
 _SETTLE = 1.0  # s: the longitudinal error fades with this time constant
 _CLEAR = 0.5  # m: samples farther apart than that tell the direction of the path
+_CREEPING = 0.5  # m/s
 _LATE = 0.5  # m/s: a place that should be passed a second sooner or later counts as that much farther away
 
 
@@ -487,6 +488,9 @@ def track(
     look = jnp.maximum(v * _LOOK, _LEAST_LOOK)
     bend = _sample(trajectory, level + limits.steering_lag + config.dt / 2).bend
     bend = bend - 2 * error / look - offset / look**2
+    # who hardly moves turns the wheels as slowly: a path of nothing tells no direction
+    present = 2 * jnp.sin(slip) / wheelbase
+    bend = present + jnp.clip(here.v / _CREEPING, 0, 1) * (bend - present)
     # of the centre's path: sin(slip) = bend * wheelbase / 2, and tan(steering) = 2 tan(slip)
     sine = jnp.clip(bend * wheelbase / 2, -0.9, 0.9)
     steering = jnp.arctan(2 * sine / jnp.sqrt(1 - sine * sine))
@@ -539,7 +543,7 @@ def _sample(trajectory: Trajectory, time: Float[Array, " E"]) -> _Sample:
         y=y0 + u * dy + rest * jnp.sin(course),
         course=course,
         v=v,
-        bend=jnp.where(inside, turn / jnp.maximum(chord, 0.1), 0),
+        bend=jnp.where(inside, turn / jnp.maximum(chord, 1e-3), 0),
         a=jnp.where(inside, (v1 - v0) / dt, 0),
         way=_take(way, k) - (1 - u) * chord + rest,
     )

@@ -37,7 +37,7 @@ class Task(NamedTuple):
     other: Others
     merge: Merge
     wanted: Float[Array, "V H"]  # m/s, speed that was decided on; fast where nothing was
-    steering: Float[Array, " V"]  # rad, largest; with `wheelbase` it bounds the curvature
+    steering: Float[Array, " V"]  # rad, largest while driving; with `wheelbase` it bounds the curvature
     wheelbase: Float[Array, " V"]
 
 
@@ -101,6 +101,7 @@ class Lattice:
       following: desired speeds of the car-following samples, as shares.
       braking: m/s^2, constant; the hardest is the driver's `b_max`.
       offsets: m off the middle of the way at the end.
+      distances: over which each of them is reached, as a share of the usual distance.
       lateral_time: s for a change of offset, at driving speed.
     """
 
@@ -111,7 +112,8 @@ class Lattice:
     stops: tuple[float, ...] = (1.0, 1.3)
     following: tuple[float, ...] = (1.0, 0.75, 0.5)
     braking: tuple[float, ...] = (2.0, 4.0)
-    offsets: tuple[float, ...] = (0.0, -0.4, 0.4)
+    offsets: tuple[float, ...] = (0.0, -0.4, 0.4, 0.0)
+    distances: tuple[float, ...] = (1.0, 1.0, 1.0, 0.5)
     lateral_time: float = 4.0
     # weights
     efficiency: float = 0.3
@@ -149,6 +151,7 @@ _MERGE_BRAKING = 2.0  # m/s^2
 _STRETCH = 30.0  # m
 _HURRY = 2.5  # times the weight of efficiency
 _MIN_LATERAL = 10.0  # m, least distance in which the offset changes
+_ROLLING = 1.5  # m/s, below which the wheels can be turned before the vehicle has moved much
 
 
 def quartic(
@@ -236,11 +239,12 @@ def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
 
     s, v, a, jerk = wide(s), wide(v), wide(a), wide(jerk)
     start = task.start
-    end = jnp.maximum(start.v * lattice.lateral_time, _MIN_LATERAL + 4 * jnp.abs(start.d))
-    goal = jnp.tile(offsets, along)
     each = lambda x: x[:, None, None]  # noqa: E731
+    end = each(jnp.maximum(start.v * lattice.lateral_time, _MIN_LATERAL + 4 * jnp.abs(start.d)))
+    end = end * jnp.tile(jnp.asarray(lattice.distances, s.dtype), along)[None, :, None]
+    goal = jnp.tile(offsets, along)[None, :, None]
     d, slope, bend, _ = quintic(
-        each(start.d), each(start.slope), each(start.bend), goal[None, :, None], 0.0, 0.0, each(end), s
+        each(start.d), each(start.slope), _first_bend(task, goal, end), goal, 0.0, 0.0, end, s
     )
     place = place_on(task.way, s, d)
     stretch = jnp.maximum(1 - place.curvature * d, 0.2)
@@ -255,6 +259,28 @@ def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
         lattice, task, envelope, s, d, place.x, place.y, heading, speed, v, a, jerk, curvature, bend
     )
     return Samples(s, d, place.x, place.y, heading, speed, curvature, cost, broken)
+
+
+def _first_bend(task: Task, goal: Array, end: Array) -> Float[Array, "V S 1"]:
+    """Second derivative, 1/m, with which samples begin that are `goal` off the way after `end`, m.
+
+    That of the present motion. Who stands can turn the wheels first: like a cubic, as far as they turn.
+    """
+    d, slope, bend, here, v, most = (
+        x[:, None, None]
+        for x in (
+            task.start.d, task.start.slope, task.start.bend, task.way.curvature[:, 0], task.start.v,
+            _tightest(task),
+        )
+    )  # fmt: skip
+    free = jnp.clip(6 * (goal - d) / end**2 - 4 * slope / end, -0.9 * most - here, 0.9 * most - here)
+    return bend + jnp.clip(1 - v / _ROLLING, 0, 1) * (free - bend)
+
+
+def _tightest(task: Task) -> Float[Array, " V"]:
+    """Largest curvature, 1/m: the last of the lock is kept for who stands or rolls."""
+    more = 1 + 0.2 * jnp.clip(1 - task.start.v / _ROLLING, 0, 1)
+    return more * jnp.tan(task.steering) / task.wheelbase
 
 
 def plan(lattice: Lattice, model: CarFollowing, task: Task) -> Plan:
@@ -425,12 +451,16 @@ def _costs(
     b_ego, b_lead = each(jnp.minimum(driver.b_max, 7.0)), 8.0
     need = (v * _REACTION + v * v / (2 * b_ego) + 1.0)[..., None] - lead_v**2 / (2 * b_lead)
     rss = jnp.where(t <= _RSS_UNTIL, jnp.maximum(jnp.maximum(need, 0.5) - gap, 0).max(-1), 0)
-    tight = jnp.maximum(jnp.abs(curvature) - each(jnp.tan(task.steering) / task.wheelbase), 0)
+    tight = jnp.maximum(jnp.abs(curvature) - each(_tightest(task)), 0)
     lateral = jnp.maximum(jnp.abs(curvature) * speed * speed - each(driver.a_lat) - 1.0, 0)
     half = each(task.width) / 2
     left, right = along(way.left), along(way.right)
-    edge = jnp.maximum(jnp.maximum(d + half - left, -d + half - right), 0)
-    edge = jnp.maximum(edge - jnp.maximum(edge[..., :1], 0.05), 0)  # who is out there already may come back
+    edge = jnp.zeros_like(d)
+    for side, room in ((1.0, left), (-1.0, right)):
+        # who is out there already may come back, and who points there may turn first
+        out = jnp.maximum(side * d + half - room, 0)
+        turning = jnp.maximum(side * task.start.slope, 0) ** 2 / _tightest(task)
+        edge = jnp.maximum(edge, out - jnp.maximum(out[..., :1], 0.05) - each(turning))
     acceleration = jnp.maximum(a - 4.0, 0) + jnp.maximum(-a - each(driver.b_max) - 0.5, 0)
     broken = (
         0.5 * jnp.max(beyond, -1)
