@@ -42,7 +42,7 @@ from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, Scenario, Schedule, State, Status
 
 GRIDLOCK = 120.0
-"""s of standing after which a vehicle is stuck and its world gridlocked; longer than lights are red."""
+"""s below walking speed after which a vehicle is stuck and its world gridlocked; longer than a red."""
 
 
 @struct.dataclass(frozen=True, kw_only=True)

@@ -97,7 +97,8 @@ class Lattice:
       dt: s between moments.
       speeds: end speeds of the quartics, between a standstill and the desired speed.
       horizons: s in which they are reached.
-      stops: durations of stops at the wall, as multiples of that with constant deceleration.
+      stops: durations of stops at the wall, as multiples of that with constant deceleration, or of moving up
+        to it from a standstill.
       following: desired speeds of the car-following samples, as shares.
       braking: m/s^2, constant; the hardest is the driver's `b_max`.
       offsets: m off the middle of the way at the end.
@@ -150,6 +151,9 @@ _ONSET = 1.0  # s in which that braking sets in
 _MERGE_BRAKING = 2.0  # m/s^2
 _STRETCH = 30.0  # m
 _HURRY = 2.5  # times the weight of efficiency
+_SLOW = 3.0  # m/s, below which there is some of this hurry, too: queues move up
+_AT_LAST = 0.3  # weight of speeding at the end of the horizon: it would have to be braked off after that
+_MOVE_UP = 10 / 3**0.5  # a quintic from rest to rest takes sqrt(this * distance / its greatest acceleration)
 _MIN_LATERAL = 10.0  # m, least distance in which the offset changes
 _ROLLING = 1.5  # m/s, below which the wheels can be turned before the vehicle has moved much
 
@@ -327,7 +331,9 @@ def _along(
     parts.append(quartic(v0, a0, v0, 2.0, t))
     # stops at the wall
     distance = jnp.maximum(task.wall, 0.05)[:, None, None]
-    stop = jnp.asarray(lattice.stops, v0.dtype)[None, :, None] * 2 * distance / jnp.maximum(v0, 0.5)
+    move_up = jnp.sqrt(_MOVE_UP * distance / task.driver.a[:, None, None])
+    stop = jnp.minimum(2 * distance / jnp.maximum(v0, 0.5), move_up)
+    stop = jnp.asarray(lattice.stops, v0.dtype)[None, :, None] * stop
     parts.append(quintic(jnp.zeros_like(v0), v0, a0, distance, 0.0, 0.0, jnp.clip(stop, 1.0, 60.0), t))
     # braking
     hard = [jnp.full_like(start.v, b) for b in lattice.braking] + [task.driver.b_max]
@@ -433,11 +439,12 @@ def _costs(
     dynamic = each(driver.T)[..., None] + approach / (2 * jnp.sqrt(each(driver.a * driver.b)))[..., None]
     wanted = each(driver.s0)[..., None] + jnp.maximum(v[..., None] * dynamic, 0)
     close = jnp.maximum(1 - gap / wanted, 0).max(-1)
-    # who joins others is best as fast as they are
-    hurry = jnp.where(task.merge.urgency > 0, _HURRY, 1.0)[:, None]
+    # who joins others is best as fast as they are, and who moves up is followed by others
+    slowly = jnp.clip(1 - task.start.v / _SLOW, 0, 1)
+    hurry = jnp.where(task.merge.urgency > 0, _HURRY, 1.0 + (_HURRY - 1.0) * slowly)[:, None]
     cost = (
         lattice.efficiency * hurry * jnp.mean(slow, -1)
-        + lattice.speeding * jnp.mean(over * over, -1)
+        + lattice.speeding * (jnp.mean(over * over, -1) + _AT_LAST * over[..., -1] ** 2)
         + lattice.acceleration * jnp.mean(a * a, -1)
         + lattice.jerk * jnp.mean(jerk * jerk, -1)
         + lattice.offset * jnp.mean(d * d, -1)
