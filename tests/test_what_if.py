@@ -72,12 +72,13 @@ def test_policies_remember_and_totals_begin_anew(now):
 
 
 def test_places_of_planned_vehicles_stay_as_many():
-    ego = EgoTable(start="1-", s=40.0, goal="3+", policy="area_of_interest", options={"slots": 3})
+    options = {"slots": 3, "around": "follow_lane"}
+    ego = EgoTable(start="1-", s=40.0, goal="3+", policy="area_of_interest", options=options)
     values = {"name": "small", "map": "roundabout", "horizon": 10.0, "slots": 8}
     episodes = Episodes(Experiment(**values, ego=ego, traffic=TrafficTable(vehicles=6)), chunk=1)
     episodes.rollout = replace(episodes.rollout, measure=None)
     run, lane_map, schedule, key, carry = stopped(episodes, SEED, [1.0])
-    assert carry.state.egos.slot.shape == carry.memory.inner[0].slot.shape == (1, 4)
+    assert carry.state.egos.slot.shape == (1, 4)
     shapes = jax.eval_shape(
         lambda lane_map: run.go_on(lane_map, schedule, key, jax.tree.map(lambda x: x[0], carry), 1), lane_map
     )
