@@ -42,7 +42,9 @@ from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, Scenario, Schedule, State, Status
 
 GRIDLOCK = 120.0
-"""s below walking speed after which a vehicle is stuck and its world gridlocked; longer than a red."""
+"""s after which a vehicle that did not get on is stuck and its world gridlocked; longer than a red."""
+GOT_ON = 5.0
+"""m that a vehicle has to get on in that time, less than a place in a queue."""
 
 
 @struct.dataclass(frozen=True, kw_only=True)
@@ -77,12 +79,20 @@ class Result(NamedTuple):
     measures: Any  # what `measure` found
 
 
+class Stood(NamedTuple):
+    """Where and when each vehicle had last got on, for `N` slots."""
+
+    at: Float[Array, " N"]  # m, of `State.distance`
+    since: Float[Array, " N"]  # s
+
+
 class Carry(NamedTuple):
     """A run that goes on: all that `Rollout.go_on` needs to know of the past."""
 
     state: State
     memory: Any  # of the policy
     totals: Totals
+    stood: Stood
     measured: Any  # by `measure` so far
 
 
@@ -229,7 +239,8 @@ class Rollout:
     def anew(self, lane_map: LaneMap, state: State, memory: Any) -> Carry:
         """Before a decision of a world that runs already: totals and metrics begin here."""
         measured = None if self.measure is None else self.measure.init(self.config, lane_map, state)
-        return mapped_like(state.s, Carry(state, memory, no_totals(state), measured))
+        stood = Stood(state.distance, jnp.full_like(state.distance, self.config.time(state.step)))
+        return mapped_like(state.s, Carry(state, memory, no_totals(state), stood, measured))
 
     def go_on(
         self,
@@ -248,7 +259,7 @@ class Rollout:
             return kept, None if measure is None else measure.look(config, lane_map, tick)
 
         def decide(carry: Carry, _: None) -> tuple[Carry, Any]:
-            state, memory, totals, measured = carry
+            state, memory, totals, stood, measured = carry
             now = jax.random.fold_in(key, state.step)
             command, memory = self.policy(config, lane_map, state, memory, now)
             after, (kept, looks) = drive(
@@ -256,7 +267,8 @@ class Rollout:
             )
             if measure is not None:
                 measured = measure.update(config, lane_map, measured, looks)
-            new = Carry(after, memory, count(config, totals, state, after), measured)
+            totals, stood = count(config, totals, stood, state, after)
+            new = Carry(after, memory, totals, stood, measured)
             if self.traffic.after_collision == "end":
                 over = collided(state)
                 new = jax.tree.map(lambda x, y: jnp.where(over, x, y), carry, new)
@@ -283,8 +295,8 @@ def no_totals(state: State) -> Totals:
 
 
 @jax.named_scope("count")
-def count(config: Config, totals: Totals, before: State, after: State) -> Totals:
-    """Totals after one decision more, all but `waiting`."""
+def count(config: Config, totals: Totals, stood: Stood, before: State, after: State) -> tuple[Totals, Stood]:
+    """Totals after one decision more, all but `waiting`; and who has got on."""
     now = config.time(after.step)
     same = (before.vehicle == after.vehicle) & (before.entered == after.entered) & before.active
     entered = jnp.sum(after.queues.next - before.queues.next, dtype=jnp.int32)
@@ -294,10 +306,13 @@ def count(config: Config, totals: Totals, before: State, after: State) -> Totals
     new = jnp.where(was, after.status & ~jnp.where(same, before.status, 0), 0)
     driven = after.distance - jnp.where(fresh, 0, before.distance)
 
+    got_on = ~(same & after.active) | (after.distance - stood.at >= GOT_ON)
+    stood = Stood(jnp.where(got_on, after.distance, stood.at), jnp.where(got_on, now, stood.since))
+
     def events(bit: Status) -> Int[Array, ""]:
         return jnp.sum((new & int(bit)) != 0, dtype=jnp.int32)
 
-    return Totals(
+    totals = Totals(
         entered=totals.entered + entered,
         left=totals.left + jnp.sum(left, dtype=jnp.int32),
         waiting=totals.waiting,
@@ -309,13 +324,14 @@ def count(config: Config, totals: Totals, before: State, after: State) -> Totals
         missed=totals.missed + events(Status.MISSED_ROUTE),
         hard=totals.hard + events(Status.HARD_BRAKE),
         broken=totals.broken + events(Status.NOT_FINITE),
-        gridlock=totals.gridlock | (after.active & (after.waiting > GRIDLOCK)).any(),
+        gridlock=totals.gridlock | (now - stood.since > GRIDLOCK).any(),
         deceleration=jnp.maximum(totals.deceleration, jnp.max(jnp.where(after.active, -after.a, 0))),
         longest_wait=jnp.maximum(totals.longest_wait, jnp.max(jnp.where(after.active, after.waiting, 0))),
         distance=totals.distance + jnp.sum(jnp.where(was, driven, 0)),
         time=totals.time + config.decision_time * jnp.sum(after.active, dtype=jnp.float32),
         travel_time=totals.travel_time + jnp.sum(jnp.where(left, now - after.entered, 0)),
     )
+    return totals, stood
 
 
 # --- many worlds -------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from limsim_jax.maps.routing import default_goals
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.policies.simple import FollowLane
-from limsim_jax.rollout import Rollout, Worlds, fork, load, save, trace, world_key
+from limsim_jax.rollout import Rollout, Worlds, count, fork, load, save, trace, world_key
 from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, entries, sample_scenario
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.vehicles import default_population, fitting, sample_vehicles, uniform_population
@@ -62,6 +62,42 @@ def test_totals_add_up_and_nothing_goes_wrong():
         assert not getattr(totals, name).any(), name
     assert (totals.deceleration < 9).all()
     assert (totals.distance / totals.time < 25).all()
+
+
+@pytest.mark.parametrize(
+    "speed, gridlocked",
+    [
+        (lambda now: 0.0, True),
+        (lambda now: 0.03, True),  # 3.6 m in two minutes
+        (lambda now: 0.05, False),
+        (lambda now: 1.0, False),  # a queue that moves
+        (lambda now: 2.0 * (now % 90 > 86), False),  # one place at every green
+        (lambda now: 2.0 * (now % 90 > 88.5), True),  # 3 m
+        (lambda now: 8.0 * (now < 70), True),
+        (lambda now: 8.0 * (now < 90), False),
+    ],
+)
+def test_who_gets_on_by_less_than_five_metres_in_two_minutes_is_stuck(speed, gridlocked):
+    """200 s: half of the vehicles drive on, half leave after 100 s, and one does what it is told."""
+    config = RUN.config
+    before = jax.jit(sampler())(jax.random.key(0)).start
+    carry = RUN.begin(bundled("roundabout")[1], before)
+    totals, stood, me = carry.totals, carry.stood, int(np.flatnonzero(before.active)[0])
+    counted = jax.jit(functools.partial(count, config))
+    leave = np.arange(SLOTS) % 2 == (me + 1) % 2
+    for step in range(round(200 / config.decision_time)):
+        now = config.decision_time * step
+        v = np.where(leave & (now >= 50), 0.0, 5.0)
+        v[me] = speed(now)
+        after = dataclasses.replace(
+            before,
+            step=before.step + config.decision_every,
+            distance=before.distance + jnp.asarray(v * config.decision_time, jnp.float32),
+            active=before.active & ~(leave & (now >= 100)),
+        )
+        totals, stood = counted(totals, stood, before, after)
+        before = after
+    assert bool(totals.gridlock) == gridlocked
 
 
 def test_a_world_is_the_same_in_any_company():

@@ -85,7 +85,7 @@ _TOTALS = {
     "collided": "vehicles that touched another, the ego included",
     "ran_red": "vehicles that crossed a stop line on red",
     "missed": "vehicles that took another goal for want of a gap to change lanes",
-    "gridlock": "1 if somebody drove below 1.5 m/s for two minutes",
+    "gridlock": "1 if somebody got on less than 5 m in two minutes",
 }
 _SHARE_OF_MEMORY = 0.25
 _TEMPORARIES = 12  # a world needs so many times the memory of its arrays while it runs
