@@ -19,7 +19,7 @@ from limsim_jax.policies import pdm
 from limsim_jax.policies.pdm import PDMClosed
 from limsim_jax.policies.reference import Way
 from limsim_jax.rollout import Rollout, trace
-from limsim_jax.traffic.ego import from_lane, with_rows
+from limsim_jax.traffic.ego import Limits, from_lane, step_free, track, with_rows
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config
@@ -183,6 +183,24 @@ def test_the_tracker_stays_on_a_circle():
     np.testing.assert_allclose(motion.v, 8.0, atol=1e-3)
     ackermann = np.arctan(np.asarray(me.wheelbase) / 30.0)
     np.testing.assert_allclose(motion.steering[..., -1], np.repeat(ackermann[:, None], P, 1), rtol=0.05)
+
+
+def test_the_bicycle_is_that_which_drives_the_egos():
+    """A slalom whose wheels turn as fast as they can: each step is one of the simulator's."""
+    me = body((9.0, 9.0), d=(0.0, 0.0))
+    wave = arc(9.0, 30.0)
+    turns = np.where(np.arange(81) % 20 < 10, 4.0, -4.0)
+    sharp = wave._replace(curvature=wave.curvature * jnp.asarray(turns, jnp.float32)[None, None])
+    motion = jax.tree.map(lambda values: np.asarray(values, float)[0, 0], pdm.drive_along(sharp, me, 80))
+    limits, wheelbase = Limits(), float(me.wheelbase[0])
+    turned = np.diff(motion.steering)
+    assert np.abs(turned).max() == pytest.approx(0.04, abs=1e-5), "0.4 rad/s"
+    assert np.abs(motion.steering).max() <= limits.steering + 1e-6
+    way = (motion.v[:-1] + motion.v[1:]) / 2 * 0.1
+    turn = way * np.tan((motion.steering[:-1] + motion.steering[1:]) / 2) / wheelbase
+    np.testing.assert_allclose(np.diff(motion.heading), turn, atol=1e-5)
+    np.testing.assert_allclose(np.diff(motion.v), (motion.a[:-1] + motion.a[1:]) / 2 * 0.1, atol=1e-5)
+    np.testing.assert_allclose(np.hypot(np.diff(motion.x), np.diff(motion.y)), way, atol=1e-4)
 
 
 def test_who_brakes_late_keeps_to_the_bend():
@@ -483,6 +501,33 @@ def test_emergency_brake():
     strict = planned("highway", behind(1.2, 4.9, 0.0), strict=True)
     assert bool(strict.brakes[0])
     np.testing.assert_allclose(np.asarray(strict.trajectory.v)[0, 1:], 1.1 * (4.9 - 4.05), atol=1e-3)
+
+
+def test_it_comes_back_to_its_lane_however_often_it_plans_anew():
+    """Planned anew ten times a second, as the public implementation is, an ego 0.8 m off its lane."""
+    state, lane_map = behind(150.0, 15.0, 15.0), bundled("highway")[1]
+    egos = state.egos
+    x, y = egos.x - 0.8 * jnp.sin(egos.heading), egos.y + 0.8 * jnp.cos(egos.heading)
+    state = dataclasses.replace(state, d=state.d.at[0].set(0.8), egos=dataclasses.replace(egos, x=x, y=y))
+
+    @jax.jit
+    def drive(state, trajectory):
+        control = track(CONFIG, Limits(), state, trajectory, CONFIG.time(state.step))
+        moved = step_free(CONFIG, lane_map, Limits(), state, control)
+        return dataclasses.replace(moved, step=state.step + 1)
+
+    turned = False
+    for _ in range(50):
+        path = planned("highway", state).trajectory
+        state = drive(state, pdm.at_middles(path))
+        # as the bend in the middle of the first two steps asks for, the first time that the wheels turn
+        bend = float(path.heading[0, 2] - path.heading[0, 0]) / (15.0 * 0.2)
+        wanted = bend * float(state.shape.wheelbase[0])
+        if not turned and abs(wanted) > 0.003:
+            assert float(state.egos.steering[0]) == pytest.approx(wanted, rel=0.25)
+            turned = True
+    assert turned
+    assert abs(float(state.d[0])) < 0.15
 
 
 def test_conventions_of_the_public_implementation():

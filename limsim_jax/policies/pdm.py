@@ -27,7 +27,7 @@ edge of the road       0.1 m of the 0.3 m that nuPlan's      to the centimetre
                        own metric allows
 profiles to track      those of the IDM and of the path      least squares over the poses
 errors in bends        against the path beside the vehicle   against the pose of that time
-bicycle                moves along its mean heading          moves along its heading before (Euler)
+bicycle                the simulator's                       nuPlan's (Euler steps)
 scores                 equal within 0.001                    exact
 emergency braking      at any speed, 7 m/s^2 along the       up to 5 m/s, poses straight on at a
                        proposal                              corrected speed
@@ -58,7 +58,7 @@ from limsim_jax.policies.predict import Predictor, nearest, straight
 from limsim_jax.policies.reference import Place, Way, place_on, way_ahead
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.traffic.collision import OVERHANG
-from limsim_jax.traffic.ego import Trajectory
+from limsim_jax.traffic.ego import Limits, Trajectory
 from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, State
 
@@ -108,7 +108,7 @@ _FAR = 1e6  # m
 _LEAST_GAP = 0.1  # m: who is nearer than the standstill gap brakes as hard as it can
 _STANDS = 0.05  # m/s: who is slower stands (nuPlan)
 _MERGE_TIME, _MERGE_LEAST = 3.0, 12.0  # s and m in which a path comes to an offset 2 m away, or farther,
-_KEEP_SHARE = 0.33  # and the least share of that for one that is nearer
+_KEEP_SHARE = 0.66  # and the least share of that for one that is nearer
 _CHANGE_WITHIN = 300.0  # m to the last place for a lane change, within which it is wished for
 _CHANGE_ROOM = 20.0  # m before that place, kept free to change lanes from a standstill
 _CHANGE_WORTH = 15.0  # m of progress that a required lane change counts for
@@ -526,6 +526,7 @@ _Q_LATERAL, _R_LATERAL = (1.0, 10.0, 0.0), 1.0
 _STOPPING, _STOPPING_GAIN = 0.2, 0.5  # m/s, 1/s
 _LAG_ACCELERATION, _LAG_STEERING = 0.2, 0.05  # s
 _MOST_STEERING = np.pi / 3  # rad
+_CAR = Limits()
 
 
 class Motion(NamedTuple):
@@ -585,7 +586,10 @@ def lqr(
 
 @jax.named_scope("pdm_track")
 def drive_along(reference: Reference, body: Body, steps: int, strict: bool = False) -> Motion:
-    """Track all proposals with the LQR and move them by a kinematic bicycle: nuPlan's (Euler) if strict."""
+    """Track all proposals with the LQR and move them by a kinematic bicycle.
+
+    It is nuPlan's if strict (Euler steps), else that which drives the egos, `traffic.ego.step_free`.
+    """
     shape = reference.x.shape[:2]
 
     def ahead(values: Array) -> Array:
@@ -610,13 +614,22 @@ def drive_along(reference: Reference, body: Body, steps: int, strict: bool = Fal
             early = cos * (x - x0) + sin * (y - y0)
             lateral, astray = lateral - bends[0] * early * early / 2, astray - bends[0] * early
         wish, rate = lqr(v, steering, lateral, astray, v_ref, list(bends), wheelbase)
-        a = a + lag_a * (wish - a)
-        turned = lag_steering * rate * DT
-        turn = v * jnp.tan(steering) / wheelbase * DT
-        course = heading if strict else heading + turn / 2
-        x, y, heading = x + v * jnp.cos(course) * DT, y + v * jnp.sin(course) * DT, heading + turn
-        v = v + a * DT
-        steering = jnp.clip(steering + turned, -_MOST_STEERING, _MOST_STEERING)
+        if strict:
+            a = a + lag_a * (wish - a)
+            turn = v * jnp.tan(steering) / wheelbase * DT
+            x, y, heading = x + v * jnp.cos(heading) * DT, y + v * jnp.sin(heading) * DT, heading + turn
+            v = v + a * DT
+            steering = jnp.clip(steering + lag_steering * rate * DT, -_MOST_STEERING, _MOST_STEERING)
+        else:
+            reached = a + (1 - jnp.exp(-DT / _CAR.acceleration_lag)) * (wish - a)
+            turned = steering + jnp.clip(rate, -_CAR.steering_rate, _CAR.steering_rate) * DT
+            turned = jnp.clip(turned, -_CAR.steering, _CAR.steering)
+            faster = jnp.maximum(v + (a + reached) / 2 * DT, 0)
+            way = (v + faster) / 2 * DT
+            turn = way * jnp.tan((steering + turned) / 2) / wheelbase
+            course = heading + turn / 2
+            x, y, heading = x + way * jnp.cos(course), y + way * jnp.sin(course), heading + turn
+            v, a, steering = faster, reached, turned
         new = x, y, heading, v, a, steering
         return new, new
 
@@ -977,7 +990,7 @@ class PDMClosed:
         """The best proposal as a trajectory over 4 s."""
         del key
         plan = self.plan(config, lane_map, state)
-        return Command(trajectory=plan.trajectory, signal=plan.signal), memory
+        return Command(trajectory=at_middles(plan.trajectory), signal=plan.signal), memory
 
     def plan(self, config: Config, lane_map: LaneMap, state: State, beyond: int = 0) -> Plan:
         """The decision, and the chosen proposal for so many steps of `DT` beyond its trajectory."""
@@ -1028,6 +1041,23 @@ def _centred(body: Body, poses: tuple[Array, ...], t0: Array) -> Trajectory:
     return Trajectory(
         x=x + axle * jnp.cos(heading), y=y + axle * jnp.sin(heading), heading=heading, v=v, t0=t0, dt=DT
     )
+
+
+def at_middles(trajectory: Trajectory) -> Trajectory:
+    """The same motion, sampled in the middle of each step, the first time half a step before it begins.
+
+    Who tracks it asks for the bend a step ahead. There two segments would meet, of which the first one has
+    hardly more than the bend of now: the wheels would turn at half of the planned rate, and not at all if
+    every step is planned anew.
+    """
+
+    def middles(values: Array) -> Array:
+        between = (values[:, :-1] + values[:, 1:]) / 2
+        return jnp.concatenate([2 * values[:, :1] - between[:, :1], between], 1)
+
+    heading = jnp.unwrap(trajectory.heading)
+    x, y, heading, v = (middles(values) for values in (trajectory.x, trajectory.y, heading, trajectory.v))
+    return replace(trajectory, x=x, y=y, heading=heading, v=v, t0=trajectory.t0 - trajectory.dt / 2)
 
 
 def _stop_along(body: Body, x: Array, y: Array, heading: Array) -> tuple[Array, ...]:
