@@ -5,13 +5,15 @@
 Worlds go to results/policies: what was killed goes on where it was, and `limsim-jax report results/policies`
 shows the worst of them. Writes experiments/results/policies.json and .md; policies and scenarios that are not
 named keep their rows. `--paper 10` adds what the first ten seeds alone give, as many as the paper has.
-Decisions are timed by `limsim-jax bench policy`; `--skip decisions` leaves that for a quiet machine.
+Decisions are timed by `limsim-jax bench policy`; `--skip decisions` leaves that for a quiet machine. Those of
+`own_policies.py`, one in JAX and one on the host, are timed as well (`--own` alone).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +30,10 @@ from limsim_jax.sweep.experiment import read_experiments
 from limsim_jax.sweep.runner import Progress, sweep
 from limsim_jax.sweep.store import open_results
 
-RESULTS = Path(__file__).parent / "results"
+HERE = Path(__file__).parent
+RESULTS = HERE / "results"
 POLICIES = ("like_traffic", "pdm_closed", "pdm_hybrid", "limsim_tm", "area_of_interest")
+OWN = ("own_policies:Cautious", "own_policies:follower")
 EVENTS = ("success", "at_fault_contacts", "contacts")
 MEANS = {"completion": "completion", "score": "limsim_faithful_drive", "nuplan": "nuplan_score"}
 
@@ -57,7 +61,7 @@ def worlds(policy: str, scenario: str, seeds: int, few: int, out: Path) -> dict[
     return row
 
 
-def decisions(policy: str, scenario: str) -> dict[str, Any]:
+def decisions(scenario: str, policy: str) -> dict[str, Any]:
     """How long they take."""
     told = bench_policy(scenario, policy, cold=True)
     return {
@@ -66,6 +70,12 @@ def decisions(policy: str, scenario: str) -> dict[str, Any]:
         "compile_s": told["amortised_compile_s"],
         "device": told["device"],
     }
+
+
+def own() -> list[dict[str, Any]]:
+    """How long decisions of a user's policies take, in JAX and on the host."""
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
+    return [{"policy": policy, "scenario": "roundabout"} | decisions("roundabout", policy) for policy in OWN]
 
 
 def summary(found: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -93,6 +103,7 @@ def main() -> None:
     parser.add_argument("--policies", nargs="+", default=list(POLICIES), choices=POLICIES)
     parser.add_argument("--scenarios", nargs="+", default=list(PAPER), choices=list(PAPER))
     parser.add_argument("--skip", choices=("worlds", "decisions"))
+    parser.add_argument("--own", action="store_true", help="time only the policies of own_policies.py")
     parser.add_argument("--out", type=Path, default=Path("results/policies"))
     options = parser.parse_args()
     if options.seeds < 1:
@@ -100,8 +111,20 @@ def main() -> None:
     use_all_cores()
     enable_compilation_cache()
     file = RESULTS / "policies.json"
-    before = json.loads(file.read_text())["rows"] if file.exists() else []
-    kept = {(r["scenario"], r["policy"]): r for r in before}
+    found = json.loads(file.read_text()) if file.exists() else {"rows": []}
+    kept = {(r["scenario"], r["policy"]): r for r in found["rows"]}
+
+    def write() -> None:
+        found["rows"] = [kept[s, p] for s in PAPER for p in POLICIES if (s, p) in kept]
+        write_whole(file, json.dumps(found, indent=1) + "\n")
+        head = "Regenerate: `python experiments/policies.py`\n\n"
+        write_whole(RESULTS / "policies.md", f"{head}{policies(found, few=True)}\n")
+
+    if options.own or options.skip != "decisions":
+        found["own"] = own()
+        write()
+    if options.own:
+        return
     for policy in options.policies:
         for scenario in options.scenarios:
             few = min(options.paper, options.seeds)
@@ -111,12 +134,9 @@ def main() -> None:
             if options.skip != "worlds":
                 row |= worlds(policy, scenario, options.seeds, few, options.out)
             if options.skip != "decisions":
-                row |= decisions(policy, scenario)
+                row |= decisions(scenario, policy)
             print(json.dumps(row), flush=True)
-            rows = [kept[s, p] for s in PAPER for p in POLICIES if (s, p) in kept]
-            write_whole(file, json.dumps({"rows": rows}, indent=1) + "\n")
-            head = "Regenerate: `python experiments/policies.py`\n\n"
-            write_whole(RESULTS / "policies.md", f"{head}{policies({'rows': rows}, few=True)}\n")
+            write()
 
 
 if __name__ == "__main__":

@@ -252,6 +252,13 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
             f"| {fault:.1f} (at most {bound:.1f}) "
             f"| {r['others_collided']} | {r.get('gridlocks', '')} |{took}"
         )
+    if "own" in result:
+        told = (
+            f"`{r['policy']}` {r['decision_ms']:.2g} ms, {r['amortised_ms']:.2g} ms in a batch, "
+            f"compiled in {r['compile_s']:.1f} s"
+            for r in result["own"]
+        )
+        rows += ["", f"Policies of 20 lines (`experiments/own_policies.py`): {'; '.join(told)}."]
     return "\n".join(rows)
 
 

@@ -4,10 +4,12 @@ import math
 import re
 import subprocess
 import sys
+import textwrap
 
 from conftest import REPO
 
 import limsim_jax as lj
+from limsim_jax.policies import host
 
 README = (REPO / "README.md").read_text()
 
@@ -19,6 +21,14 @@ def test_example(capsys):
     assert "laneSection" in capsys.readouterr().out
     assert abs(float(names["s"]) - 25.0) < 1e-3 and abs(float(names["d"]) - 0.5) < 1e-3
     assert math.isclose(float(names["slope"]), math.cos(float(names["heading"])), abs_tol=1e-3)
+
+
+def test_own_policies_are_those_that_are_shown():
+    code = (REPO / "experiments" / "own_policies.py").read_text()
+    (shown,) = re.findall(r"```python\n(@dataclass\(frozen=True\)\nclass Cautious:.*?)```", README, re.DOTALL)
+    assert shown in code
+    (shown,) = re.findall(r"( {4}def follow.*?)\n\n", host.__doc__ or "", re.DOTALL)
+    assert textwrap.dedent(shown) in code
 
 
 def test_figures_are_those_measured():
