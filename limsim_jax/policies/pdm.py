@@ -588,7 +588,8 @@ def lqr(
 def drive_along(reference: Reference, body: Body, steps: int, strict: bool = False) -> Motion:
     """Track all proposals with the LQR and move them by a kinematic bicycle.
 
-    It is nuPlan's if strict (Euler steps), else that which drives the egos, `traffic.ego.step_free`.
+    It is nuPlan's if strict (Euler steps), else that which drives the egos (`traffic.ego.step_free`) but for
+    its bound on lateral acceleration.
     """
     shape = reference.x.shape[:2]
 
