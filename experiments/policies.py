@@ -6,7 +6,7 @@ Worlds go to results/policies: what was killed goes on where it was, and `limsim
 shows the worst of them. Writes experiments/results/policies.json and .md; policies and scenarios that are not
 named keep their rows. `--paper 10` adds what the first ten seeds alone give, as many as the paper has.
 Decisions are timed by `limsim-jax bench policy`; `--skip decisions` leaves that for a quiet machine. Those of
-`own_policies.py`, one in JAX and one on the host, are timed as well (`--own` alone).
+`own_policies.py`, one in JAX and one on the host, are timed as well (`--policies own`).
 """
 
 from __future__ import annotations
@@ -100,10 +100,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=1000)
     parser.add_argument("--paper", type=int, default=10)
-    parser.add_argument("--policies", nargs="+", default=list(POLICIES), choices=POLICIES)
+    named = (*POLICIES, "own")
+    parser.add_argument("--policies", nargs="+", default=list(named), choices=named)
     parser.add_argument("--scenarios", nargs="+", default=list(PAPER), choices=list(PAPER))
     parser.add_argument("--skip", choices=("worlds", "decisions"))
-    parser.add_argument("--own", action="store_true", help="time only the policies of own_policies.py")
     parser.add_argument("--out", type=Path, default=Path("results/policies"))
     options = parser.parse_args()
     if options.seeds < 1:
@@ -120,12 +120,12 @@ def main() -> None:
         head = "Regenerate: `python experiments/policies.py`\n\n"
         write_whole(RESULTS / "policies.md", f"{head}{policies(found, few=True)}\n")
 
-    if options.own or options.skip != "decisions":
-        found["own"] = own()
-        write()
-    if options.own:
-        return
     for policy in options.policies:
+        if policy == "own":
+            if options.skip != "decisions":
+                found["own"] = own()
+                write()
+            continue
         for scenario in options.scenarios:
             few = min(options.paper, options.seeds)
             if options.skip == "worlds" and (scenario, policy) not in kept:
