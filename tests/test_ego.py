@@ -665,6 +665,32 @@ def test_tracking_recovers_from_offsets_and_comes_to_rest():
     assert (side / start).min() > -0.1
 
 
+@pytest.mark.parametrize("dt", [0.05, 0.1, 0.2])
+def test_a_bend_that_grows_evenly_is_that_of_each_moment(dt):
+    """A clothoid at 10 m/s, however it is sampled, also at the samples; a step of no length says nothing."""
+    growth = np.array([0.02, -0.05])[:, None]  # 1/m each second
+    t = dt * np.arange(41)
+    heading = 10 * growth * t**2 / 2
+    course = (heading[:, 1:] + heading[:, :-1]) / 2
+    x, y = (np.cumsum(np.pad(10 * dt * f(course), ((0, 0), (1, 0))), -1) for f in (np.cos, np.sin))
+    rows = (jnp.asarray(z, jnp.float32) for z in (x, y, heading, np.full_like(x, 10.0), 2.0))
+    clothoid = Trajectory(**dict(zip(("x", "y", "heading", "v", "t0"), rows, strict=True)), dt=dt)
+    for time in (0.5 * dt, dt, 1.3 * dt, 5 * dt, 39.5 * dt):
+        found = ego._sample(clothoid, jnp.full(2, 2.0 + time, jnp.float32)).bend
+        np.testing.assert_allclose(found, growth[:, 0] * time, rtol=2e-3, atol=1e-5)
+    # a circle of 20 m that begins with a step of standing, whose heading trembles
+    still = dataclasses.replace(
+        clothoid,
+        x=jnp.asarray([[0.0, 0.0, 1.0, 2.0]] * 2),
+        y=jnp.zeros((2, 4)),
+        heading=jnp.asarray([[0.0, 1e-5, 0.05, 0.1]] * 2),
+        v=jnp.ones((2, 4)),
+    )
+    for place in (0.7, 1.0, 1.4):
+        found = ego._sample(still, jnp.full(2, 2.0 + place * dt, jnp.float32)).bend
+        np.testing.assert_allclose(found, 0.05, rtol=2e-3)
+
+
 def test_a_trajectory_goes_on_straight_after_its_end():
     x = jnp.asarray([[0.0, 1.0, 2.0, 2.5]] * 2)
     trajectory = Trajectory(

@@ -11,7 +11,7 @@ from traffic_worlds import bundled, state_of
 
 from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.policies import pdm_learned
-from limsim_jax.policies.pdm import PDMClosed, at_middles
+from limsim_jax.policies.pdm import PDMClosed
 from limsim_jax.policies.pdm_learned import (
     BEYOND,
     Features,
@@ -82,25 +82,17 @@ def test_inputs_are_in_the_frame_of_the_ego():
     assert seen.plan.shape == (1, 16, 3) and (np.diff(seen.plan[0, :, 0]) > 0).all()
 
 
-def between_middles(middles):
-    """The values whose `at_middles` these are."""
-    found = [(float(middles[0]) + float(middles[1])) / 2]
-    for middle in middles[1:]:
-        found.append(2 * float(middle) - found[-1])
-    return np.array(found)
-
-
 def test_two_seconds_are_those_of_the_rules_and_the_rest_is_corrected():
     plan, seen, (command, poses) = foreseen()
     trajectory = command.trajectory
     for name in ("x", "y", "heading", "v"):
-        ours, rules = getattr(trajectory, name)[0], getattr(at_middles(plan.trajectory), name)[0]
+        ours, rules = getattr(trajectory, name)[0], getattr(plan.trajectory, name)[0]
         np.testing.assert_allclose(ours[:21], rules[:21], atol=1e-4)
     assert trajectory.x.shape == (1, 81)
     # at the poses the trajectory is what the network says
     _, state = world()
     x0, y0, h0 = (float(getattr(state.egos, k)[0]) for k in ("x", "y", "heading"))
-    dx, dy = between_middles(trajectory.x[0])[25::5] - x0, between_middles(trajectory.y[0])[25::5] - y0
+    dx, dy = trajectory.x[0, 25::5] - x0, trajectory.y[0, 25::5] - y0
     np.testing.assert_allclose(np.cos(h0) * dx + np.sin(h0) * dy, poses[0, 4:, 0], atol=0.05)
     np.testing.assert_allclose(np.cos(h0) * dy - np.sin(h0) * dx, poses[0, 4:, 1], atol=0.05)
     assert np.abs(poses - seen.plan).max() > 0.01, "the weights that come along do something"

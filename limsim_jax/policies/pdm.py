@@ -588,8 +588,7 @@ def lqr(
 def drive_along(reference: Reference, body: Body, steps: int, strict: bool = False) -> Motion:
     """Track all proposals with the LQR and move them by a kinematic bicycle.
 
-    It is nuPlan's if strict (Euler steps), else that which drives the egos (`traffic.ego.step_free`) but for
-    its bound on lateral acceleration.
+    It is nuPlan's if strict (Euler steps), else that which drives the egos (`traffic.ego.step_free`).
     """
     shape = reference.x.shape[:2]
 
@@ -627,7 +626,8 @@ def drive_along(reference: Reference, body: Body, steps: int, strict: bool = Fal
             turned = jnp.clip(turned, -_CAR.steering, _CAR.steering)
             faster = jnp.maximum(v + (a + reached) / 2 * DT, 0)
             way = (v + faster) / 2 * DT
-            turn = way * jnp.tan((steering + turned) / 2) / wheelbase
+            most = _CAR.lateral_acceleration / jnp.maximum(v * v, 0.1)
+            turn = way * jnp.clip(jnp.tan((steering + turned) / 2) / wheelbase, -most, most)
             course = heading + turn / 2
             x, y, heading = x + way * jnp.cos(course), y + way * jnp.sin(course), heading + turn
             v, a, steering = faster, reached, turned
@@ -991,7 +991,7 @@ class PDMClosed:
         """The best proposal as a trajectory over 4 s."""
         del key
         plan = self.plan(config, lane_map, state)
-        return Command(trajectory=at_middles(plan.trajectory), signal=plan.signal), memory
+        return Command(trajectory=plan.trajectory, signal=plan.signal), memory
 
     def plan(self, config: Config, lane_map: LaneMap, state: State, beyond: int = 0) -> Plan:
         """The decision, and the chosen proposal for so many steps of `DT` beyond its trajectory."""
@@ -1042,23 +1042,6 @@ def _centred(body: Body, poses: tuple[Array, ...], t0: Array) -> Trajectory:
     return Trajectory(
         x=x + axle * jnp.cos(heading), y=y + axle * jnp.sin(heading), heading=heading, v=v, t0=t0, dt=DT
     )
-
-
-def at_middles(trajectory: Trajectory) -> Trajectory:
-    """The same motion, sampled in the middle of each step, the first time half a step before it begins.
-
-    Who tracks it asks for the bend a step ahead. There two segments would meet, of which the first one has
-    hardly more than the bend of now: the wheels would turn at half of the planned rate, and not at all if
-    every step is planned anew.
-    """
-
-    def middles(values: Array) -> Array:
-        between = (values[:, :-1] + values[:, 1:]) / 2
-        return jnp.concatenate([2 * values[:, :1] - between[:, :1], between], 1)
-
-    heading = jnp.unwrap(trajectory.heading)
-    x, y, heading, v = (middles(values) for values in (trajectory.x, trajectory.y, heading, trajectory.v))
-    return replace(trajectory, x=x, y=y, heading=heading, v=v, t0=trajectory.t0 - trajectory.dt / 2)
 
 
 def _stop_along(body: Body, x: Array, y: Array, heading: Array) -> tuple[Array, ...]:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from limsim_jax.files import write_whole
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.pdm import DT, STEPS, PDMClosed, Plan, at_middles, bodies, road_ahead
+from limsim_jax.policies.pdm import DT, STEPS, PDMClosed, Plan, bodies, road_ahead
 from limsim_jax.policies.reference import place_on
 from limsim_jax.traffic.ego import Trajectory
 from limsim_jax.traffic.engine import Command
@@ -268,7 +268,7 @@ class PDMHybrid:
         trajectory = Trajectory(
             x=x, y=y, heading=heading, v=jnp.where(late, moved, v), t0=config.time(state.step), dt=DT
         )
-        return Command(trajectory=at_middles(trajectory), signal=plan.signal), poses
+        return Command(trajectory=trajectory, signal=plan.signal), poses
 
 
 # --- weights -----------------------------------------------------------------------------------------

@@ -421,7 +421,8 @@ class Trajectory:
     """Where the centre of each ego's body should be at `H` >= 2 moments.
 
     `heading` may be that of the body or of the path: only how it changes counts at driving speed.
-    Between samples the path is straight: space them by 0.2 s or less in bends.
+    Between samples the path is straight: space them by 0.2 s or less in bends. Wheels are turned for a
+    bend that changes evenly from the middle of one step between samples to that of the next.
     """
 
     x: Float[Array, "E H"]  # m
@@ -511,7 +512,13 @@ class _Sample(NamedTuple):
 
 
 def _sample(trajectory: Trajectory, time: Float[Array, " E"]) -> _Sample:
-    """The trajectory at a time (s) of each ego."""
+    """The trajectory at a time (s) of each ego.
+
+    Its bend in the middle of a step between samples is the step's turn over its length; elsewhere it is
+    that of a mixture of the two steps around, so that a step of hardly any length counts for as little.
+    If a step had the same bend all along, who looks a step ahead would still find that of now, and
+    planning anew at every step would never turn the wheels.
+    """
     dt, count = trajectory.dt, trajectory.x.shape[-1]
     steps = jnp.stack([jnp.diff(trajectory.x), jnp.diff(trajectory.y)], -1)
     chords = safe_norm(steps)
@@ -519,19 +526,20 @@ def _sample(trajectory: Trajectory, time: Float[Array, " E"]) -> _Sample:
     place = (time - trajectory.t0) / dt
     k, u = interval(place, count - 1)
     u = jnp.clip(u, 0, 1)
-    x0, y0, v0, v1, h0, h1 = (
+    x0, y0, h0, v0, v1 = (
         _take(values, k + n)
         for values, n in (
-            (trajectory.x, 0), (trajectory.y, 0), (trajectory.v, 0), (trajectory.v, 1),
-            (trajectory.heading, 0), (trajectory.heading, 1),
+            (trajectory.x, 0), (trajectory.y, 0), (trajectory.heading, 0),
+            (trajectory.v, 0), (trajectory.v, 1),
         )
     )  # fmt: skip
-    turn, dx, dy, chord = (
-        wrap_angle(h1 - h0),
-        _take(steps[..., 0], k),
-        _take(steps[..., 1], k),
-        _take(chords, k),
-    )
+    turns = wrap_angle(jnp.diff(trajectory.heading))
+    turn, dx, dy, chord = (_take(values, k) for values in (turns, steps[..., 0], steps[..., 1], chords))
+    # the two steps with this place between their middles
+    before = jnp.clip(jnp.floor(place - 0.5).astype(k.dtype), 0, count - 2)
+    after = jnp.minimum(before + 1, count - 2)
+    share = jnp.clip(place - 0.5 - before.astype(place.dtype), 0, 1)
+    turned, went = ((1 - share) * _take(z, before) + share * _take(z, after) for z in (turns, chords))
     clear = jnp.clip(chord / _CLEAR, 0, 1)
     course = h0 + u * turn + clear * wrap_angle(direction(dx, dy) - h0 - turn / 2)
     v = v0 + u * (v1 - v0)
@@ -543,7 +551,7 @@ def _sample(trajectory: Trajectory, time: Float[Array, " E"]) -> _Sample:
         y=y0 + u * dy + rest * jnp.sin(course),
         course=course,
         v=v,
-        bend=jnp.where(inside, turn / jnp.maximum(chord, 1e-3), 0),
+        bend=jnp.where(inside, turned / jnp.maximum(went, 1e-3), 0),
         a=jnp.where(inside, (v1 - v0) / dt, 0),
         way=_take(way, k) - (1 - u) * chord + rest,
     )
