@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.numerics import interval
-from limsim_jax.policies.reference import Frenet, Way, place_on
+from limsim_jax.numerics import computed_once, interval, mapped_like
+from limsim_jax.policies.reference import Frenet, Place, Way, place_on
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
 from limsim_jax.types import Driver
 
@@ -231,41 +231,49 @@ def leaders(task: Task, t: Float[Array, "*#b"]) -> tuple[Float[Array, "*b J"], F
 
 
 def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
-    """All samples of the lattice for every vehicle, with their costs."""
+    """All samples of the lattice for every vehicle, with their costs: each motion along with each offset.
+
+    What depends on the motion along the way alone is worked out once for all offsets.
+    """
     envelope = speed_envelope(task)
     s, v, a, jerk = _along(lattice, model, task, envelope)  # [V A H]
-    offsets = jnp.asarray(lattice.offsets, s.dtype)
-    count, along, moments = s.shape
-    across = offsets.shape[0]
-
-    def wide(x: Array) -> Array:
-        return jnp.broadcast_to(x[:, :, None], (count, along, across, moments)).reshape(count, -1, moments)
-
-    s, v, a, jerk = wide(s), wide(v), wide(a), wide(jerk)
     start = task.start
-    each = lambda x: x[:, None, None]  # noqa: E731
-    end = each(jnp.maximum(start.v * lattice.lateral_time, _MIN_LATERAL + 4 * jnp.abs(start.d)))
-    end = end * jnp.tile(jnp.asarray(lattice.distances, s.dtype), along)[None, :, None]
-    goal = jnp.tile(offsets, along)[None, :, None]
+    goal = jnp.asarray(lattice.offsets, s.dtype)[None, :, None]
+    end = jnp.maximum(start.v * lattice.lateral_time, _MIN_LATERAL + 4 * jnp.abs(start.d))
+    end = end[:, None, None] * jnp.asarray(lattice.distances, s.dtype)[None, :, None]
+    first = _first_bend(task, goal, end)
+    d0, slope0 = (x[:, None, None, None] for x in (start.d, start.slope))
     d, slope, bend, _ = quintic(
-        each(start.d), each(start.slope), _first_bend(task, goal, end), goal, 0.0, 0.0, end, s
-    )
-    place = place_on(task.way, s, d)
+        d0, slope0, first[:, None], goal[:, None], 0.0, 0.0, end[:, None], s[:, :, None]
+    )  # [V A O H]
+    place = Place(*(x[:, :, None] for x in place_on(task.way, s, jnp.zeros_like(s))))
     stretch = jnp.maximum(1 - place.curvature * d, 0.2)
     skew = slope / stretch
     turned = lax.rsqrt(1 + skew * skew)  # cosine of the angle to the way
-    heading = place.heading + jnp.arctan(skew)
+    cos_way, sin_way = jnp.cos(place.heading), jnp.sin(place.heading)
+    x, y = place.x - d * sin_way, place.y + d * cos_way
+    cos, sin = turned * (cos_way - skew * sin_way), turned * (sin_way + skew * cos_way)
     curvature = ((bend + place.curvature * slope * skew) * turned**2 / stretch + place.curvature) * (
         turned / stretch
     )
-    speed = v * stretch / turned
-    cost, broken = _costs(
-        lattice, task, envelope, s, d, place.x, place.y, heading, speed, v, a, jerk, curvature, bend
+    speed = v[:, :, None] * stretch / turned
+    # the costs use them over and over
+    d, bend, x, y, cos, sin, curvature, speed = computed_once((d, bend, x, y, cos, sin, curvature, speed))
+    cost, broken, room = _costs_along(lattice, task, envelope, s, v, a, jerk)
+    more, worse = _costs_across(lattice, task, room, d, x, y, cos, sin, speed, curvature, bend)
+
+    def flat(values: Array) -> Array:
+        values = jnp.broadcast_to(values, d.shape[: values.ndim])
+        return values.reshape(values.shape[0], -1, *values.shape[3:])
+
+    return Samples(
+        *(flat(z) for z in (s[:, :, None], d, x, y, place.heading + jnp.arctan(skew), speed, curvature)),
+        cost=flat(cost[:, :, None] + more),
+        broken=flat(broken[:, :, None] + worse),
     )
-    return Samples(s, d, place.x, place.y, heading, speed, curvature, cost, broken)
 
 
-def _first_bend(task: Task, goal: Array, end: Array) -> Float[Array, "V S 1"]:
+def _first_bend(task: Task, goal: Array, end: Array) -> Float[Array, "V O 1"]:
     """Second derivative, 1/m, with which samples begin that are `goal` off the way after `end`, m.
 
     That of the present motion. Who stands can turn the wheels first: like a cubic, as far as they turn.
@@ -403,23 +411,10 @@ def _follow(
     return s, v, a, jerk
 
 
-def _costs(
-    lattice: Lattice,
-    task: Task,
-    envelope: Array,
-    s: Array,
-    d: Array,
-    x: Array,
-    y: Array,
-    heading: Array,
-    speed: Array,
-    v: Array,
-    a: Array,
-    jerk: Array,
-    curvature: Array,
-    bend: Array,
-) -> tuple[Float[Array, "V S"], Float[Array, "V S"]]:
-    """Cost of every sample, and by how much it breaks bounds."""
+def _costs_along(
+    lattice: Lattice, task: Task, envelope: Array, s: Array, v: Array, a: Array, jerk: Array
+) -> tuple[Float[Array, "V A"], Float[Array, "V A"], tuple[Float[Array, "V A H"], Float[Array, "V A H"]]]:
+    """Cost of every motion along the way, by how much it breaks bounds, and the room left and right, m."""
     way, driver, t = task.way, task.driver, lattice.times()[None, None]
     each = lambda value: value[:, None, None]  # noqa: E731
     flat = (s.shape[0], -1)
@@ -429,11 +424,11 @@ def _costs(
         low, high = jnp.take_along_axis(table, k, 1), jnp.take_along_axis(table, k + 1, 1)
         return (low + jnp.clip(u, 0, 1) * (high - low)).reshape(s.shape)
 
-    allowed = along(envelope)
     # against one speed for all samples: who gets to where more is allowed must not look slower for it
-    slow, over = jnp.maximum(each(_fastest(task, envelope)) - v, 0), jnp.maximum(v - allowed, 0)
+    slow = jnp.maximum(each(_fastest(task, envelope)) - v, 0)
+    over = jnp.maximum(v - along(envelope), 0)
     far, lead_v = leaders(task, t)
-    gap = jnp.minimum(far - s[..., None], NO_GAP)  # [V S H J]
+    gap = jnp.minimum(far - s[..., None], NO_GAP)  # [V A H J]
     # the gap that IDM wants, which grows with the speed at which one comes nearer
     approach = v[..., None] - lead_v
     dynamic = each(driver.T)[..., None] + approach / (2 * jnp.sqrt(each(driver.a * driver.b)))[..., None]
@@ -442,47 +437,69 @@ def _costs(
     # who joins others is best as fast as they are, and who moves up is followed by others
     slowly = jnp.clip(1 - task.start.v / _SLOW, 0, 1)
     hurry = jnp.where(task.merge.urgency > 0, _HURRY, 1.0 + (_HURRY - 1.0) * slowly)[:, None]
+    missing = _no_gap(task, s, v, t)
     cost = (
         lattice.efficiency * hurry * jnp.mean(slow, -1)
         + lattice.speeding * (jnp.mean(over * over, -1) + _AT_LAST * over[..., -1] ** 2)
         + lattice.acceleration * jnp.mean(a * a, -1)
         + lattice.jerk * jnp.mean(jerk * jerk, -1)
-        + lattice.offset * jnp.mean(d * d, -1)
-        + lattice.bending * jnp.mean((bend * speed) ** 2, -1) / 25
         + lattice.headway * jnp.mean(close * close, -1)
         + lattice.decision * jnp.mean(jnp.square(jnp.maximum(v - task.wanted[:, None], 0)), -1)
+        + lattice.merging * task.merge.urgency[:, None] * jnp.min(missing + 0.05 * t, -1)
     )
 
-    # bounds
     beyond = jnp.maximum(s - jnp.maximum(each(task.wall), 0) - 0.3, 0)
     b_ego, b_lead = each(jnp.minimum(driver.b_max, 7.0)), 8.0
     need = (v * _REACTION + v * v / (2 * b_ego) + 1.0)[..., None] - lead_v**2 / (2 * b_lead)
     rss = jnp.where(t <= _RSS_UNTIL, jnp.maximum(jnp.maximum(need, 0.5) - gap, 0).max(-1), 0)
-    tight = jnp.maximum(jnp.abs(curvature) - each(_tightest(task)), 0)
-    lateral = jnp.maximum(jnp.abs(curvature) * speed * speed - each(driver.a_lat) - 1.0, 0)
-    half = each(task.width) / 2
-    left, right = along(way.left), along(way.right)
-    edge = jnp.zeros_like(d)
-    for side, room in ((1.0, left), (-1.0, right)):
-        # who is out there already may come back, and who points there may turn first
-        out = jnp.maximum(side * d + half - room, 0)
-        turning = jnp.maximum(side * task.start.slope, 0) ** 2 / _tightest(task)
-        edge = jnp.maximum(edge, out - jnp.maximum(out[..., :1], 0.05) - each(turning))
     acceleration = jnp.maximum(a - 4.0, 0) + jnp.maximum(-a - each(driver.b_max) - 0.5, 0)
+    broken = 0.5 * jnp.max(beyond, -1) + 0.1 * jnp.max(rss, -1) + jnp.max(acceleration, -1)
+    return cost, broken, (along(way.left), along(way.right))
+
+
+def _costs_across(
+    lattice: Lattice,
+    task: Task,
+    room: tuple[Array, Array],
+    d: Array,
+    x: Array,
+    y: Array,
+    cos: Array,
+    sin: Array,
+    speed: Array,
+    curvature: Array,
+    bend: Array,
+) -> tuple[Float[Array, "V A O"], Float[Array, "V A O"]]:
+    """What offsets, bends and others add to the cost and to the breach of bounds; all are `[V A O H]`.
+
+    `cos` and `sin` are those of the heading.
+    """
+    each = lambda value: value[:, None, None, None]  # noqa: E731
+    tightest = each(_tightest(task))
+    tight = jnp.maximum(jnp.abs(curvature) - tightest, 0)
+    lateral = jnp.maximum(jnp.abs(curvature) * speed * speed - each(task.driver.a_lat) - 1.0, 0)
+    half = each(task.width) / 2
+    edge = jnp.zeros_like(d)
+    for side, free in zip((1.0, -1.0), room, strict=True):
+        # who is out there already may come back, and who points there may turn first
+        out = jnp.maximum(side * d + half - free[:, :, None], 0)
+        turning = jnp.maximum(side * each(task.start.slope), 0) ** 2 / tightest
+        edge = jnp.maximum(edge, out - jnp.maximum(out[..., :1], 0.05) - turning)
+    touch, near = _meet(task, x, y, cos, sin)
+    fade = jnp.exp(-lattice.times() / _FORGET)[None, None, None]
+    cost = (
+        lattice.offset * jnp.mean(d * d, -1)
+        + lattice.bending * jnp.mean((bend * speed) ** 2, -1) / 25
+        + lattice.proximity * jnp.mean(near, -1)
+    )
     broken = (
-        0.5 * jnp.max(beyond, -1)
-        + 0.1 * jnp.max(rss, -1)
-        + 10 * jnp.max(tight, -1)
+        10 * jnp.max(tight, -1)
         + 0.1 * jnp.max(lateral, -1)
         + jnp.max(edge, -1)
-        + jnp.max(acceleration, -1)
+        + _TOUCH / _BROKEN * jnp.max(touch * fade, -1)
+        + 0.2 * jnp.sum(touch * fade, -1)
     )
-    touch, near = _meet(lattice, task, x, y, heading)
-    fade = jnp.exp(-t / _FORGET)
-    broken = broken + _TOUCH / _BROKEN * jnp.max(touch * fade, -1) + jnp.sum(touch * fade, -1) * 0.2
-    missing = _no_gap(task, s, v, t)
-    cost = cost + lattice.merging * task.merge.urgency[:, None] * jnp.min(missing + 0.05 * t, -1)
-    return cost + lattice.proximity * jnp.mean(near, -1), broken
+    return cost, broken
 
 
 def room_needed(
@@ -501,7 +518,7 @@ def room_needed(
     return 2.0 + short + 0.5 * faster + faster * faster / (2 * braking)
 
 
-def _no_gap(task: Task, s: Array, v: Array, t: Array) -> Float[Array, "V S H"]:
+def _no_gap(task: Task, s: Array, v: Array, t: Array) -> Float[Array, "V A H"]:
     """How far the vehicle is from a gap in the traffic that it has to join: 0 level with one that will do.
 
     It will do if who comes from behind, or we, can brake to the other's speed with `_MERGE_BRAKING`.
@@ -520,26 +537,33 @@ def _no_gap(task: Task, s: Array, v: Array, t: Array) -> Float[Array, "V S H"]:
 
 
 def _meet(
-    lattice: Lattice, task: Task, x: Array, y: Array, heading: Array
-) -> tuple[Float[Array, "V S H"], Float[Array, "V S H"]]:
+    task: Task, x: Array, y: Array, cos: Array, sin: Array
+) -> tuple[Float[Array, "V A O H"], Float[Array, "V A O H"]]:
     """Whether others are touched, 0 or 1, and how near they come beside, 0 to 1.
 
     The other's box as seen along our axes, with room around: at most a little too large.
     """
-    other = task.other
-    cos, sin = jnp.cos(heading), jnp.sin(heading)
-    half_length, half_width = task.length[:, None, None] / 2, task.width[:, None, None] / 2
-    touch, near = jnp.zeros_like(x), jnp.zeros_like(x)
-    for k in range(other.x.shape[1]):
-        dx, dy = other.x[:, k, None] - x, other.y[:, k, None] - y
-        turned = other.heading[:, k, None] - heading
-        c, s = jnp.abs(jnp.cos(turned)), jnp.abs(jnp.sin(turned))
-        its_length, its_width = other.length[:, k, None, None] / 2, other.width[:, k, None, None] / 2
+    each = lambda value: value[:, None, None, None]  # noqa: E731
+    at_times = lambda value: value[:, None, None]  # noqa: E731
+    half_length, half_width = each(task.length) / 2, each(task.width) / 2
+
+    def look(seen: tuple[Array, Array], one: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:
+        touch, near = seen
+        its_x, its_y, its_cos, its_sin = (at_times(z) for z in one[:4])
+        its_length, its_width, counts = each(one[4]) / 2, each(one[5]) / 2, each(one[6])
+        dx, dy = its_x - x, its_y - y
+        c, s = jnp.abs(cos * its_cos + sin * its_sin), jnp.abs(cos * its_sin - sin * its_cos)
         ahead = jnp.abs(dx * cos + dy * sin) - half_length - c * its_length - s * its_width
-        aside = jnp.abs(-dx * sin + dy * cos) - half_width - s * its_length - c * its_width
-        counts = other.counts[:, k, None, None]
-        hit = (ahead < _MARGIN) & (aside < _SIDE) & counts
-        touch = jnp.maximum(touch, hit.astype(x.dtype))
-        beside = jnp.clip(1 - aside, 0, 1)
-        near = jnp.maximum(near, jnp.where(counts & (ahead < _MARGIN), beside, 0))
-    return touch, near
+        aside = jnp.abs(dy * cos - dx * sin) - half_width - s * its_length - c * its_width
+        level = counts & (ahead < _MARGIN)
+        touch = jnp.maximum(touch, (level & (aside < _SIDE)).astype(x.dtype))
+        near = jnp.maximum(near, jnp.where(level, jnp.clip(1 - aside, 0, 1), 0))
+        return (touch, near), None
+
+    # one after the other: unrolled, XLA would work out the places of all samples anew for each
+    other = task.other
+    by_other = (other.x, other.y, jnp.cos(other.heading), jnp.sin(other.heading))
+    by_other = (*by_other, other.length, other.width, other.counts)
+    by_other = tuple(jnp.moveaxis(z, 1, 0) for z in by_other)
+    nobody = mapped_like(x, (jnp.zeros_like(x), jnp.zeros_like(x)))
+    return lax.scan(look, nobody, by_other)[0]
