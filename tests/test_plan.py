@@ -213,6 +213,21 @@ def test_a_leader_that_brakes_hard_is_braked_for():
     assert float(hard.x[0].max()) < stop
 
 
+@pytest.mark.parametrize("urgency", [0.0, 1.0])
+def test_a_queue_far_ahead_is_braked_for_in_time(urgency):
+    """From 27 m/s to who stands 140 m ahead, planned anew twice a second; also who has to change lanes."""
+    gap, v, a, hardest = 140.0, 27.0, 0.0, 0.0
+    for _ in range(30):
+        queue = task(v=v, a=a, lead=(gap, 0.0), limit=33.0)
+        queue = queue._replace(merge=queue.merge._replace(urgency=jnp.full(1, urgency)))
+        x, speed = (np.asarray(z[0], float) for z in planned(queue)[0:4:3])
+        hardest = max(hardest, -np.diff(speed)[:3].min() / LATTICE.dt)
+        a = (speed[3] - speed[2]) / LATTICE.dt
+        gap, v = gap - np.interp(0.5, LATTICE.times(), x), np.interp(0.5, LATTICE.times(), speed)
+    assert 27.0**2 / (2 * 138) < hardest < 4.4, "6.7 if only what comes within the horizon counted"
+    assert v < 1.0 and 1.5 < gap < 12
+
+
 def test_who_needs_a_gap_keeps_its_speed_until_it_has_to_stop():
     """Braking late and firmly at the end of its lane, against early and mildly at a line."""
     case = task(v=20.0, limit=25.0, wall=150.0)

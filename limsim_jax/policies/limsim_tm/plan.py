@@ -437,12 +437,17 @@ def _costs_along(
     # who joins others is best as fast as they are, and who moves up is followed by others
     slowly = jnp.clip(1 - task.start.v / _SLOW, 0, 1)
     hurry = jnp.where(task.merge.urgency > 0, _HURRY, 1.0 + (_HURRY - 1.0) * slowly)[:, None]
+    # who would have to brake after the end of the horizon brakes now
+    closing = jnp.maximum(approach[:, :, -1], 0)
+    remaining = jnp.maximum(gap[:, :, -1] - driver.s0[:, None, None], 0.1)
+    later = jnp.minimum(closing * closing / (2 * remaining), driver.b_max[:, None, None]).max(-1)
     missing = _no_gap(task, s, v, t)
     cost = (
         lattice.efficiency * hurry * jnp.mean(slow, -1)
         + lattice.speeding * (jnp.mean(over * over, -1) + _AT_LAST * over[..., -1] ** 2)
         + lattice.acceleration * jnp.mean(a * a, -1)
         + lattice.jerk * jnp.mean(jerk * jerk, -1)
+        + lattice.acceleration * later * later
         + lattice.headway * jnp.mean(close * close, -1)
         + lattice.decision * jnp.mean(jnp.square(jnp.maximum(v - task.wanted[:, None], 0)), -1)
         + lattice.merging * task.merge.urgency[:, None] * jnp.min(missing + 0.05 * t, -1)
