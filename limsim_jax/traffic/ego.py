@@ -536,9 +536,8 @@ def _sample(trajectory: Trajectory, time: Float[Array, " E"]) -> _Sample:
     turns = wrap_angle(jnp.diff(trajectory.heading))
     turn, dx, dy, chord = (_take(values, k) for values in (turns, steps[..., 0], steps[..., 1], chords))
     # the two steps with this place between their middles
-    before = jnp.clip(jnp.floor(place - 0.5).astype(k.dtype), 0, count - 2)
-    after = jnp.minimum(before + 1, count - 2)
-    share = jnp.clip(place - 0.5 - before.astype(place.dtype), 0, 1)
+    before, share = interval(place - 0.5, count - 1)
+    after, share = jnp.minimum(before + 1, count - 2), jnp.clip(share, 0, 1)
     turned, went = ((1 - share) * _take(z, before) + share * _take(z, after) for z in (turns, chords))
     clear = jnp.clip(chord / _CLEAR, 0, 1)
     course = h0 + u * turn + clear * wrap_angle(direction(dx, dy) - h0 - turn / 2)

@@ -567,8 +567,7 @@ def _meet(
 
     # one after the other: unrolled, XLA would work out the places of all samples anew for each
     other = task.other
-    by_other = (other.x, other.y, jnp.cos(other.heading), jnp.sin(other.heading))
-    by_other = (*by_other, other.length, other.width, other.counts)
-    by_other = tuple(jnp.moveaxis(z, 1, 0) for z in by_other)
+    cos_k, sin_k = jnp.cos(other.heading), jnp.sin(other.heading)
+    each_of = (other.x, other.y, cos_k, sin_k, other.length, other.width, other.counts)
     nobody = mapped_like(x, (jnp.zeros_like(x), jnp.zeros_like(x)))
-    return lax.scan(look, nobody, by_other)[0]
+    return lax.scan(look, nobody, tuple(jnp.moveaxis(z, 1, 0) for z in each_of))[0]
