@@ -46,6 +46,7 @@ from limsim_jax.metrics.safety import (
     ttc_1d,
 )
 from limsim_jax.metrics.scores import (
+    OVER_LIMIT,
     LimSimCarry,
     against_flow_init,
     against_flow_update,
@@ -413,7 +414,7 @@ class EgoMetrics:
             rss_first=carry.rss_first.add(t, t, unsafe | tight),
             contact=contact,
             nuplan_ttc=carry.nuplan_ttc & kept,
-            speeding=share(carry.speeding, over > 0.01),
+            speeding=share(carry.speeding, over > OVER_LIMIT),
             max_overspeed=jnp.maximum(carry.max_overspeed, over),
             overspeed=carry.overspeed + jnp.where(drove, over * dt, 0),
             off_road=share(carry.off_road, step.off_road),

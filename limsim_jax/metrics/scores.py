@@ -30,8 +30,9 @@ failure                 0.6 whenever the goal is not         0.6 for a contact b
                         standstill alike                     fault; standing still costs completion
 ======================  ===================================  =======================================
 
-One difference from the released code remains in both: its TTC moves boxes along lane centre lines with
-their present heading, ours goes straight on (see `safety.ttc_2d`).
+Two differences from the released code remain in both: its TTC moves boxes along lane centre lines with
+their present heading, ours goes straight on (see `safety.ttc_2d`); and it counts every speed above the
+limit, we those above it by `OVER_LIMIT`, lest rounding decide on who drives at the limit.
 """
 
 from __future__ import annotations
@@ -86,6 +87,9 @@ LIMSIM_BOUNDS = {
 
 LIMSIM_TTC = 5.0
 """s: TTC at which LimSim++'s safety is 1."""
+
+OVER_LIMIT = 0.01
+"""m/s: speeding is what exceeds the limit by more; who drives at the limit is above it by rounding."""
 
 Scalar = Float[Array, "*b"]
 Number = Float[Array, "*#b"] | Int[Array, "*#b"] | float | int
@@ -375,7 +379,7 @@ def limsim_update(
     efficiency = limsim_efficiency(second.v / steps, around.value, around.valid, limit)
     corrected = jnp.where(second.waits, 1, efficiency)
     safety = jnp.minimum(second.ttc / LIMSIM_TTC, 1)
-    over = second.fastest > limit
+    over = second.fastest > limit + OVER_LIMIT
     mean_comfort = jnp.mean(jnp.stack(comfort))
     score = 100 * (0.25 * mean_comfort + 0.25 * corrected + 0.5 * safety)
 
@@ -391,7 +395,7 @@ def limsim_update(
         safety=carry.safety.add(safety, full),
         speeding=carry.speeding.add(over.astype(a.dtype), full),
         reds=carry.reds + (full & second.red & in_junction).astype(jnp.int32),
-        corrected_speeding=carry.corrected_speeding.add((v > limit).astype(a.dtype), counts),
+        corrected_speeding=carry.corrected_speeding.add((v > limit + OVER_LIMIT).astype(a.dtype), counts),
         corrected_reds=carry.corrected_reds + red_light.astype(jnp.int32),
     )
 
