@@ -29,7 +29,6 @@ from limsim_jax.policies.limsim_tm.search import (
     Plan,
     Scene,
     Settings,
-    no_conflicts,
     no_plan,
     play,
     search,
@@ -100,7 +99,6 @@ def road(
         other_v=floats(np.repeat(rest[:, 1:2], len(t), 1)),
         other_length=jnp.full(number, 4.8),
         other_width=jnp.full(number, 1.9),
-        conflicts=no_conflicts(count, number),
         lane_width=floats(LANE_WIDTH),
     )
 
@@ -174,7 +172,7 @@ def by_mctx(policy: str, settings: Settings, scenes: Scene) -> Plan:
             return jnp.take_along_axis(moments, at[None], 0)[0]
 
         others = jax.tree.map(of, tm._moments(settings, scene))
-        new = tm._decision(settings, tm._prepare(scene), scene, motion, score, action, others, k)[:2]
+        new = tm._decision(settings, tm._prepare(scene), scene, motion, score, action, others)[:2]
         return jax.tree.map(lambda a, b: jnp.where(k < depth, a, b), new, (motion, score))
 
     advance = jax.vmap(tm._batch_last(step))

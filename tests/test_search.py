@@ -28,17 +28,6 @@ def default(count):
     return jnp.full((count, SHORT.decisions), -1)
 
 
-def crossing(gap_of_other=NO_GAP):
-    """Two vehicles on ways that cross 30 m ahead; 1 gives way to 0."""
-    scene = quality.road([(0, 12, 0), (0, 12, 0)], lanes=1, steps=STEPS)
-    apart = jnp.full((2, 2), NO_GAP)
-    begin = jnp.where(jnp.eye(2, dtype=bool), NO_GAP, 30.0)
-    conflicts = scene.conflicts._replace(
-        meets=apart, begin=begin, end=begin + 4, gives_way=jnp.asarray([[False, False], [True, False]])
-    )
-    return scene._replace(conflicts=conflicts)
-
-
 # ---- the model of the road
 
 
@@ -88,17 +77,6 @@ def test_collisions_between_samples_and_whose_loss_it_is():
     plan = DRIVE(scene, jnp.zeros((2, 3), jnp.int32))
     assert plan.crashed.all()
     assert plan.reward[1] < plan.reward[0] < 0
-
-
-def test_crossing_ways():
-    scene = crossing()
-    plan = DRIVE(scene, default(2).at[0].set(Meta.ACCELERATE))
-    assert not plan.crashed.any()
-    assert plan.s[0, -1] > 40 and plan.v[1].min() < 9  # who gives way has braked
-    both = DRIVE(scene, jnp.full((2, 3), Meta.ACCELERATE))
-    assert both.crashed.all() and both.reward[1] < both.reward[0]
-    alone = DRIVE(scene._replace(active=jnp.asarray([False, True])), default(2))
-    assert alone.v[1].min() > 11
 
 
 # ---- the search

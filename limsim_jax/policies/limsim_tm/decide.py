@@ -190,7 +190,6 @@ def scene(
         other_v=jnp.broadcast_to(state.v[others][:, None], away.shape),
         other_length=state.shape.length[others],
         other_width=state.shape.width[others],
-        conflicts=search.no_conflicts(count, near.shape[0]),
         lane_width=breadth,
     )
 

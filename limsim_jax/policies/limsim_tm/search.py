@@ -36,53 +36,13 @@ ACTIONS = 5
 """KEEP, ACCELERATE, DECELERATE, LEFT, RIGHT: those of `traffic.ego.Meta` but STOP."""
 
 
-class Conflicts(NamedTuple):
-    """Vehicles on different ways, which cross or merge. Distances are positions `s` on the own way, m.
-
-    While `i` is between `begin[i, j]` and `end[i, j]`, it is where the way of `j` runs: with its front
-    past `begin` and its rear not yet past `end`. `NO_GAP` in both where the ways do not touch.
-    """
-
-    shift: Float[
-        Array, "G G"
-    ]  # m: `s` of j on the way of i is s_j + shift[i, j]; of ways that merge or are one
-    meets: Float[Array, "G G"]  # m, where i comes onto lanes of j: -NO_GAP on the same road, NO_GAP never
-    begin: Float[Array, "G G"]
-    end: Float[Array, "G G"]
-    gives_way: Bool[Array, "G G"]  # i to j
-    other_beside: Bool[Array, "G K"]  # the predictions of this other are in the coordinates of i
-    other_begin: Float[Array, "G K"]
-    other_end: Float[Array, "G K"]
-    other_in: Float[Array, "G K"]  # s from now: the other is there from then ...
-    other_out: Float[Array, "G K"]  # ... until then
-    gives_way_to_other: Bool[Array, "G K"]
-
-
-def no_conflicts(vehicles: int, others: int) -> Conflicts:
-    """All on one road."""
-    own, other = (vehicles, vehicles), (vehicles, others)
-    return Conflicts(
-        shift=jnp.zeros(own),
-        meets=jnp.full(own, -NO_GAP),
-        begin=jnp.full(own, NO_GAP),
-        end=jnp.full(own, NO_GAP),
-        gives_way=jnp.zeros(own, bool),
-        other_beside=jnp.ones(other, bool),
-        other_begin=jnp.full(other, NO_GAP),
-        other_end=jnp.full(other, NO_GAP),
-        other_in=jnp.full(other, NO_GAP),
-        other_out=jnp.full(other, NO_GAP),
-        gives_way_to_other=jnp.zeros(other, bool),
-    )
-
-
 class Scene(NamedTuple):
     """`G` vehicles that are decided together and `K` others, on a corridor of `L` parallel lanes.
 
     Lanes count from 0 at the right; `s` runs along the corridor and `y` to the left from the centre of
-    lane 0. Vehicles on other ways have corridors of their own, related by `conflicts`. The others are
-    given at the `H = decisions * substeps + 1` moments of the search, from now on; put one that is not on
-    the corridor (yet) at a `y` far away.
+    lane 0. Lights and who goes first where ways cross are in `stop`. The others are given at the
+    `H = decisions * substeps + 1` moments of the search, from now on; put one that is not on the corridor
+    (yet) at a `y` far away.
     """
 
     active: Bool[Array, " G"]
@@ -108,7 +68,6 @@ class Scene(NamedTuple):
     other_v: Float[Array, "K H"]  # m/s
     other_length: Float[Array, " K"]
     other_width: Float[Array, " K"]
-    conflicts: Conflicts
     lane_width: Float[Array, ""]  # m
 
 
@@ -129,7 +88,6 @@ class Settings:
     jerk: float = 0.05  # at a change of 4 m/s^2 within a sub-step, grows as the square
     change: float = 0.04  # once for each lane change
     push: float = 0.3  # while others must brake with 4 m/s^2 for a vehicle that moved before them
-    right_of_way: float = 0.5  # while in the way of one that goes first
     crash: float = 1.5  # once
 
     @property
@@ -226,16 +184,9 @@ class _Score(NamedTuple):
 class _Pairs(NamedTuple):
     """What does not change within a search, of each vehicle and each of `M`: the group, or the others."""
 
+    present: Array  # [G, M]
     length: Array  # [M]
-    shift: Array  # [G, M]
-    far: Array  # m, position (in coordinates of i) that m must have passed to be on the way of i
-    merges: Array  # they share a lane whatever `y`
-    wide: Array  # m, both half widths
-    begin: Array
-    end: Array
-    window: tuple[Array, Array]  # where (of the group) or when (the others) m enters and leaves the conflict
-    crosses: Array
-    gives_way: Array
+    wide: Array  # [G, M] m, both half widths
     behind: float  # share of the loss when m runs into the rear of i
 
 
@@ -250,60 +201,36 @@ class _Bodies(NamedTuple):
 _FAR = 4 * NO_GAP
 _MARGIN_S, _MARGIN_Y = 0.5, 0.15  # m, added to lengths and widths in collision checks
 _LEAST_GAP = 0.5  # m, formulas of car following are evaluated here below it
-_STARTING = 3.0  # m/s, what a vehicle that stands is taken to drive through a conflict at
-_MEETING = 1.0  # s, time kept clear before and after one with right of way
 _MOVED = 0.5  # m to the side: it has left the place behind its old leader
 _DECELERATE = 2.0  # m/s^2
 
 
 def _prepare(scene: Scene) -> tuple[_Pairs, _Pairs]:
-    c = scene.conflicts
     count = scene.s.shape[0]
     itself = jnp.eye(count, dtype=bool)
     itself = itself.reshape(itself.shape + (1,) * (scene.s.ndim - 1))
-    present = scene.active[None] & ~itself
-    zone = present & (c.begin < NO_GAP)
-    far = jnp.where(present, c.meets, _FAR)
     group = _Pairs(
+        present=scene.active[None] & ~itself,
         length=scene.length,
-        shift=c.shift,
-        far=far,
-        merges=(far > -NO_GAP) & (far < NO_GAP),
         wide=(scene.width[:, None] + scene.width[None]) / 2,
-        begin=jnp.where(zone, c.begin, _FAR),
-        end=jnp.where(zone, c.end, _FAR),
-        window=(jnp.swapaxes(c.begin, 0, 1), jnp.swapaxes(c.end, 0, 1) + scene.length[None]),
-        crosses=zone & (far >= NO_GAP),
-        gives_way=zone & c.gives_way,
         behind=0.5,
     )
-    zone = scene.other_active[None] & (c.other_begin < NO_GAP)
     others = _Pairs(
+        present=jnp.broadcast_to(scene.other_active[None], (count, *scene.other_active.shape)),
         length=scene.other_length,
-        shift=jnp.zeros_like(c.other_begin),
-        far=jnp.where(c.other_beside & scene.other_active[None], -_FAR, _FAR),
-        merges=jnp.zeros_like(c.other_beside),
         wide=(scene.width[:, None] + scene.other_width[None]) / 2,
-        begin=jnp.where(zone, c.other_begin, _FAR),
-        end=jnp.where(zone, c.other_end, _FAR),
-        window=(c.other_in, c.other_out),
-        crosses=zone,
-        gives_way=zone & c.gives_way_to_other,
         behind=0.0,
     )
     return group, others
 
 
 def _most(x: Array) -> Array:
-    """Maximum over axis 1, as arithmetic on the axes behind: a reduction would not become vector code."""
+    """Maximum over axis 1."""
     return _fold(jnp.maximum, x)
 
 
-def _any(x: Array) -> Array:
-    return _fold(jnp.logical_or, x)
-
-
 def _fold(operator: Callable[[Array, Array], Array], x: Array) -> Array:
+    """Over axis 1, as arithmetic on the axes behind: a reduction would not become vector code."""
     result = x[:, 0]
     for k in range(1, x.shape[1]):
         result = operator(result, x[:, k])
@@ -318,54 +245,27 @@ def _stop_of(scene: Scene, lane: Array) -> Array:
     return result
 
 
-def _windows(pairs: _Pairs, motion: _Motion, time: Array) -> tuple[Array, Array]:
-    """When the other one enters and leaves the conflict, s from now; `[G, M]`."""
-    enters, leaves = pairs.window
-    if pairs.behind == 0:
-        return enters - time, leaves - time
-    pace = 1 / jnp.maximum(motion.v, _STARTING)[None]
-    return (enters - motion.s[None]) * pace, (leaves - motion.s[None]) * pace
-
-
 class _Ahead(NamedTuple):
     """The most that anything ahead asks for; `[G]`."""
 
     z: Array  # desired gap over gap
     needed: Array  # m/s^2, braking
-    hold: Array  # m to a conflict that it may not enter
 
 
-def _look_ahead(
-    pairs: _Pairs, scene: Scene, motion: _Motion, bodies: _Bodies, yields: Array, time: Array
-) -> _Ahead:
+def _look_ahead(pairs: _Pairs, scene: Scene, motion: _Motion, bodies: _Bodies) -> _Ahead:
     driver, v, front = scene.driver, motion.v, motion.s[:, None]
     goal = motion.aim * scene.lane_width
-    ahead = bodies.s[None] + pairs.shift
     low, high = jnp.minimum(motion.y, goal)[:, None], jnp.maximum(motion.y, goal)[:, None]
     reach = pairs.wide + _MARGIN_Y
-    leads = (ahead > pairs.far) & (ahead > front)
-    leads &= pairs.merges | ((bodies.y[None] > low - reach) & (bodies.y[None] < high + reach))
-    gap = jnp.where(leads, jnp.maximum(ahead - pairs.length[None] - front, _LEAST_GAP), NO_GAP)
+    leads = pairs.present & (bodies.s[None] > front)
+    leads &= (bodies.y[None] > low - reach) & (bodies.y[None] < high + reach)
+    gap = jnp.where(leads, jnp.maximum(bodies.s[None] - pairs.length[None] - front, _LEAST_GAP), NO_GAP)
     per_gap = computed_once(1 / gap)
     closing = v[:, None] - bodies.v[None]
     wish = driver.s0[:, None] + jnp.maximum(
         (v * driver.T)[:, None] + (v * _half(driver))[:, None] * closing, 0
     )
-
-    to_begin = pairs.begin - front
-    pace = 1 / jnp.maximum(v, _STARTING)[:, None]
-    enters, leaves = _windows(pairs, motion, time)
-    mine_out = (pairs.end + (scene.length - motion.s)[:, None]) * pace
-    meets = (to_begin * pace < leaves + _MEETING) & (enters < mine_out + _MEETING)
-    can = to_begin > (0.5 * v * v / driver.b_max)[:, None]
-    minds = pairs.gives_way & yields[:, None] & meets & can
-    blocked = (leaves > 0) & (to_begin > 0) & (minds | (pairs.crosses & (enters < 0)))
-    hold = computed_once(jnp.where(blocked, -to_begin, -NO_GAP))
-    return _Ahead(
-        z=_most(wish * per_gap),
-        needed=_most(0.5 * jnp.square(jnp.maximum(closing, 0)) * per_gap),
-        hold=-_most(hold),
-    )
+    return _Ahead(z=_most(wish * per_gap), needed=_most(0.5 * jnp.square(jnp.maximum(closing, 0)) * per_gap))
 
 
 def _half(driver: Driver) -> Array:
@@ -377,8 +277,6 @@ def _accelerate(
     scene: Scene,
     motion: _Motion,
     others: _Bodies,
-    yields: Array,
-    time: Array,
 ) -> Array:
     """IDM behind all who are on the way to the lane aimed at, and behind where to stop; m/s^2.
 
@@ -388,14 +286,11 @@ def _accelerate(
     driver, v = scene.driver, motion.v
     own = _Bodies(motion.s, motion.y, v)
     near, far = computed_once(
-        [
-            _look_ahead(of, scene, motion, bodies, yields, time)
-            for of, bodies in zip(pairs, (own, others), strict=True)
-        ]
+        [_look_ahead(of, scene, motion, bodies) for of, bodies in zip(pairs, (own, others), strict=True)]
     )
     here = jnp.round(motion.y / scene.lane_width)
-    stop = jnp.minimum(_stop_of(scene, here), _stop_of(scene, motion.aim)) - motion.s
-    stand = jnp.maximum(jnp.minimum(jnp.minimum(near.hold, far.hold), stop), 0.1)
+    stop = jnp.minimum(_stop_of(scene, here), _stop_of(scene, motion.aim))
+    stand = jnp.maximum(stop - motion.s, 0.1)
     z = (driver.s0 + v * driver.T + v * v * _half(driver)) / stand
     z = jnp.maximum(z, jnp.maximum(near.z, far.z))
     needed = jnp.maximum(0.5 * v * v / stand, jnp.maximum(near.needed, far.needed))
@@ -409,32 +304,22 @@ class _Contact(NamedTuple):
     """What a vehicle did to its neighbours; `[G]`."""
 
     loss: Array  # share of a collision
-    rude: Array  # in the way of one that goes first
     pushed: Array  # how hard others must brake for it
 
 
-def _look_around(
-    pairs: _Pairs, scene: Scene, motion: _Motion, bodies: _Bodies, time: Array, dt: float
-) -> _Contact:
-    front, length = motion.s[:, None], scene.length[:, None]
-    place = bodies.s[None] + pairs.shift
-    ahead = place - front  # front to front
-    side = jnp.abs(bodies.y[None] - motion.y[:, None]) < pairs.wide + _MARGIN_Y
-    beside = (place > pairs.far) & jnp.where(pairs.merges, front > pairs.far, side)
+def _look_around(pairs: _Pairs, scene: Scene, motion: _Motion, bodies: _Bodies, dt: float) -> _Contact:
+    length = scene.length[:, None]
+    ahead = bodies.s[None] - motion.s[:, None]  # front to front
+    beside = jnp.abs(bodies.y[None] - motion.y[:, None]) < pairs.wide + _MARGIN_Y
+    beside &= pairs.present
     overlap = (ahead - pairs.length[None] < _MARGIN_S) & (ahead + length > -_MARGIN_S)
-    enters, leaves = _windows(pairs, motion, time)
-    inside = (front > pairs.begin) & (front - length < pairs.end) & (leaves > 0)
 
-    # who has changed lanes, or was behind, or has to give way, loses most
+    # who has changed lanes, or was behind, loses most
     start = scene.lane * scene.lane_width + scene.d
     moved = (jnp.abs(motion.y - start) > _MOVED)[:, None]
     before = ahead + (motion.v[:, None] - bodies.v[None]) * dt
     share = jnp.where(moved | (before > 0), 1.0, pairs.behind)
-    loss = jnp.where(beside & overlap, share, 0)
-    met = inside & pairs.crosses & (enters < 0)
-    loss = jnp.maximum(loss, jnp.where(met, jnp.where(pairs.gives_way, 1.0, 0.5), 0))
-    rude = inside & pairs.gives_way & (enters < _MEETING)
-    loss, beside, rude = computed_once((loss, beside, rude))
+    loss, beside = computed_once((jnp.where(beside & overlap, share, 0), beside))
     if pairs.behind > 0:
         pushed = jnp.zeros_like(motion.s)
     else:
@@ -443,7 +328,7 @@ def _look_around(
         closing = jnp.maximum(bodies.v[None] - v, 0)
         short = jnp.maximum(1 - back / (1 + 0.5 * v), 0)
         pushed = _most(jnp.where(beside & moved & (ahead < 0), closing**2 / (8 * back) + short, 0))
-    return _Contact(loss=_most(loss), rude=_any(rude), pushed=pushed)
+    return _Contact(loss=_most(loss), pushed=pushed)
 
 
 def _drive(
@@ -453,14 +338,12 @@ def _drive(
     motion: _Motion,
     score: _Score,
     cap: Array,
-    yields: Array,
     now: _Bodies,
     then: _Bodies,
-    time: Array,
 ) -> tuple[_Motion, _Score]:
     """One sub-step: the group moves, others go from `now` to `then`; what it earns."""
     dt, width = settings.dt, scene.lane_width
-    a = _accelerate(pairs, scene, motion, now, yields, time)
+    a = _accelerate(pairs, scene, motion, now)
     a = jnp.where(scene.active, jnp.minimum(a, cap), 0)
     v, way = ballistic(motion.v, a, dt)
     a = (v - motion.v) / dt
@@ -470,10 +353,7 @@ def _drive(
 
     own = _Bodies(after.s, y, v)
     near, far = computed_once(
-        [
-            _look_around(of, scene, after, bodies, time + dt, dt)
-            for of, bodies in zip(pairs, (own, then), strict=True)
-        ]
+        [_look_around(of, scene, after, bodies, dt) for of, bodies in zip(pairs, (own, then), strict=True)]
     )
     place = y / width
     passed = after.s > _stop_of(scene, jnp.round(place))
@@ -487,7 +367,6 @@ def _drive(
     earned -= settings.lane * off * urgency
     earned -= settings.comfort * jnp.square(a / 4) + settings.jerk * jnp.square((a - motion.a) / 4)
     earned -= settings.push * jnp.minimum(far.pushed, 1)
-    earned -= jnp.where(near.rude | far.rude, settings.right_of_way, 0)
     reward = score.reward + score.alive * (earned / settings.steps - settings.crash * loss)
     alive = jnp.where(loss > 0, 0, score.alive)
     return after, _Score(reward=reward, alive=alive)
@@ -503,14 +382,13 @@ def _allowed(scene: Scene, motion: _Motion) -> tuple[Array, Array]:
 
 def _decide(
     settings: Settings, scene: Scene, motion: _Motion, score: _Score, action: Array
-) -> tuple[_Motion, _Score, Array, Array]:
-    """A decision begins: the new aim, what it costs, most acceleration, and who gives way."""
+) -> tuple[_Motion, _Score, Array]:
+    """A decision begins: the new aim, what it costs, and most acceleration."""
     left, right = _allowed(scene, motion)
     step = jnp.where((action == Meta.LEFT) & left, 1.0, jnp.where((action == Meta.RIGHT) & right, -1.0, 0.0))
     reward = score.reward - score.alive * settings.change * jnp.abs(step)
     cap = jnp.where(action == Meta.KEEP, 0.0, jnp.where(action == Meta.DECELERATE, -_DECELERATE, NO_GAP))
-    yields = action != Meta.ACCELERATE
-    return motion._replace(aim=motion.aim + step), score._replace(reward=reward), cap, yields
+    return motion._replace(aim=motion.aim + step), score._replace(reward=reward), cap
 
 
 def _start(scene: Scene) -> tuple[_Motion, _Score]:
@@ -538,15 +416,13 @@ def _decision(
     score: _Score,
     action: Array,
     others: _Bodies,
-    depth: Array,
 ) -> tuple[_Motion, _Score, list[_Motion]]:
     """Drive on to the next decision."""
-    motion, score, cap, yields = _decide(settings, scene, motion, score, action)
+    motion, score, cap = _decide(settings, scene, motion, score, action)
     passed = []
     for k in range(settings.substeps):
         now, then = (_Bodies(*(x[n] for x in others)) for n in (k, k + 1))
-        time = (depth * settings.substeps + k).astype(motion.s.dtype) * settings.dt
-        motion, score = _drive(settings, pairs, scene, motion, score, cap, yields, now, then, time)
+        motion, score = _drive(settings, pairs, scene, motion, score, cap, now, then)
         passed.append(motion)
     return motion, score, passed
 
@@ -563,13 +439,13 @@ def _utility(scene: Scene, reward: Array) -> Array:
 def _play(settings: Settings, scene: Scene, actions: Array) -> Plan:
     pairs = _prepare(scene)
     motion, score = first, _ = _start(scene)
-    xs = _moments(settings, scene), jnp.arange(settings.decisions), jnp.moveaxis(actions, 1, 0)
+    xs = _moments(settings, scene), jnp.moveaxis(actions, 1, 0)
 
     def decision(
-        carry: tuple[_Motion, _Score], x: tuple[_Bodies, Array, Array]
+        carry: tuple[_Motion, _Score], x: tuple[_Bodies, Array]
     ) -> tuple[tuple[_Motion, _Score], _Motion]:
-        others, depth, action = x
-        motion, score, passed = _decision(settings, pairs, scene, *carry, action, others, depth)
+        others, action = x
+        motion, score, passed = _decision(settings, pairs, scene, *carry, action, others)
         return (motion, score), jax.tree.map(lambda *of: jnp.stack(of), *passed)
 
     (motion, score), passed = lax.scan(decision, (motion, score), xs)
@@ -686,7 +562,7 @@ def _search(settings: Settings, scene: Scene, previous: Array, noise: Array) -> 
             child = jnp.where(inside & (k < depth - 1), _child(tree, link), -1)
             new = jnp.where(inside & (child < 0) & (k < depth - 1), link, new)
             action = jnp.where(inside[None], action, -1)
-            motion, score, _ = _decision(settings, pairs, scene, motion, score, action, others, k)
+            motion, score, _ = _decision(settings, pairs, scene, motion, score, action, others)
             return (motion, score, child, new), (node, action)
 
         root = jnp.zeros(batch, jnp.int32)
@@ -747,11 +623,9 @@ def _worth(scene: Scene, score: _Score, utility: Array) -> Array:
 
 __all__ = [
     "ACTIONS",
-    "Conflicts",
     "Plan",
     "Scene",
     "Settings",
-    "no_conflicts",
     "no_plan",
     "play",
     "search",
