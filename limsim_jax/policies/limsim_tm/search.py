@@ -184,7 +184,7 @@ class _Score(NamedTuple):
 class _Pairs(NamedTuple):
     """What does not change within a search, of each vehicle and each of `M`: the group, or the others."""
 
-    present: Array  # [G, M]
+    present: Array  # [G, M] or [1, M]
     length: Array  # [M]
     wide: Array  # [G, M] m, both half widths
     behind: float  # share of the loss when m runs into the rear of i
@@ -216,7 +216,7 @@ def _prepare(scene: Scene) -> tuple[_Pairs, _Pairs]:
         behind=0.5,
     )
     others = _Pairs(
-        present=jnp.broadcast_to(scene.other_active[None], (count, *scene.other_active.shape)),
+        present=scene.other_active[None],
         length=scene.other_length,
         wide=(scene.width[:, None] + scene.other_width[None]) / 2,
         behind=0.0,
