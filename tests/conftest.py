@@ -8,6 +8,7 @@ from pathlib import Path
 _cache = tempfile.TemporaryDirectory(prefix="limsim-jax-tests-")
 os.environ["LIMSIM_JAX_CACHE"] = _cache.name
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # false alarms of programs from the cache
 # Most of the time of a test run is compilation, and most of that the optimisation of machine code, which
 # runs of a few seconds do not earn back. XLA's own passes, which decide what is computed, stay as they are.
 os.environ.setdefault(

@@ -375,6 +375,32 @@ def test_a_lane_change_by_steering():
     assert (side == 1).any() and (side == -1).any() and side[0] == side[-1] == 0
 
 
+def test_who_crosses_a_line_at_the_end_of_the_lanes_stays_on_the_route():
+    """The lanes beyond the line part there, and overlap: the body is on both, the route goes on along one."""
+    _, lane_map = bundled("roundabout")
+    after, parts = np.asarray(lane_map.routes.next_lane), np.asarray(lane_map.successors)
+    length, is_goal = np.asarray(lane_map.length), np.asarray(lane_map.routes.is_goal)
+    cases = {}
+    for over, beside in ((1, np.asarray(lane_map.left)), (-1, np.asarray(lane_map.right))):
+        for row in np.flatnonzero((beside >= 0) & ((parts[beside] >= 0).sum(-1) == 2)):
+            x, y, _ = pose(lane_map, row, length[row] + 0.5, 2.6 * over)
+            own = parts[row][parts[row] >= 0]
+            s, d, _ = to_frenet(lane_map, own, np.full(len(own), 0.5), x, y)
+            if (np.abs(d) < np.asarray(width(lane_map, own, s)) / 2 + 0.15).any():
+                continue  # on a lane that its own leads to
+            for goal in np.flatnonzero((after[row] >= 0) & (after[beside[row]] >= 0) & ~is_goal[row]):
+                cases[int(row), over, int(after[beside[row], goal])] = int(goal)
+    rows, over, onto = (list(column) for column in zip(*sorted(cases)[:N], strict=True))
+    goals = [cases[case] for case in sorted(cases)[:N]]
+    assert len(set(rows)) == N / 2, "from each onto two lanes, by the route alone"
+    assert len(set(onto)) == N
+    state = free_world("roundabout", rows, length[rows] - 0.3 + 2.5, [8.0], goals)
+    x, y, heading = pose(lane_map, np.array(rows), length[rows] - 0.3, 2.6 * np.array(over))
+    state = dataclasses.replace(state, egos=dataclasses.replace(state.egos, x=x, y=y, heading=heading))
+    _, trace = run(roll, "roundabout", INSTANT, state, controls(0.0, 0.0))
+    np.testing.assert_array_equal(trace["lane"][0], onto)
+
+
 def test_off_the_road_and_back():
     _, lane_map = bundled("intersection")
     row = int(np.nonzero((np.asarray(lane_map.right) < 0) & (np.asarray(lane_map.length) > 80))[0][0])

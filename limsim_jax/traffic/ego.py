@@ -78,8 +78,9 @@ def step_free(config: Config, lane_map: LaneMap, limits: Limits, state: State, c
     that of the rear axle; who brakes to a standstill stays there.
 
     The lane is the one that the centre of the body is on: at its end the successor that it lies on (of
-    several, the one of the route), beside it the neighbour beyond the line. Off all lanes it stays with the
-    last one, and `s` and `d` go on along that. On the goal lane `s` grows beyond the end: see `arrived`.
+    several, the one of the route), beside it the neighbour beyond the line, past both the next of that by
+    the route. Off all lanes it stays with the last one, and `s` and `d` go on along that. On the goal lane
+    `s` grows beyond the end: see `arrived`.
     `side` tells that the body reaches over the line to a neighbour, whose traffic then sees it, too.
     """
     egos, dt = state.egos, config.dt
@@ -189,7 +190,9 @@ def _find_lane(
     best = jnp.argmin(misfit - jnp.where(lanes == wanted[:, None], _WANTED, 0), -1)
     lane, s, misfit = _take(lanes, best), _take(places, best), _take(misfit, best)
     lost = state.egos.free & state.active[slot] & (misfit > _LOST)
-    lane, s = _anywhere(lane_map, lost, lane, s, here)
+    beside, beside_s = lanes[:, 1:3], guess[:, 1:3]
+    onward = jnp.where(beside == NO_LANE, NO_LANE, lane_map.routes.next_lane[beside, goal[:, None]])
+    lane, s = _anywhere(lane_map, lost, lane, s, here, onward, beside_s - lane_map.length[beside])
     s, d, along = to_frenet(lane_map, lane, s, x, y)
 
     # The front bumper may be on the next lane already: that of before, else of the route, else any.
@@ -259,9 +262,18 @@ def _misfit(lane_map: LaneMap, lanes: Array, guess: Array, here: tuple[Array, ..
 
 
 def _anywhere(
-    lane_map: LaneMap, lost: Array, lane: Array, s: Array, here: tuple[Array, ...]
+    lane_map: LaneMap,
+    lost: Array,
+    lane: Array,
+    s: Array,
+    here: tuple[Array, ...],
+    onward: Int[Array, "E 2"],
+    guess: Float[Array, "E 2"],
 ) -> tuple[Array, Array]:
     """Look for the lane of those who are `lost` in the whole map; off all lanes they keep the last one.
+
+    Who has crossed a line where the lanes end is on a lane `onward`, the next by the route from the lanes
+    beside, near `guess` m: where those part they overlap with others, and the nearest may lead elsewhere.
 
     A loop of at most one pass: it costs nothing while nobody is lost, in any world of a batch.
     """
@@ -272,6 +284,12 @@ def _anywhere(
         other, other_s, d, _ = project(lane_map, x, y, heading)
         found = lost & (other != NO_LANE) & (jnp.abs(d) <= width(lane_map, other, other_s) / 2)
         found &= (other_s >= 0) & (other_s <= lane_map.length[other])
+        misfit, places = _misfit(lane_map, onward, guess, here)
+        best = jnp.argmin(misfit, -1)
+        past = lost & (_take(misfit, best) <= _LOST)
+        other = jnp.where(past, _take(onward, best), other)
+        other_s = jnp.where(past, _take(places, best), other_s)
+        found |= past
         return jnp.zeros_like(lost), jnp.where(found, other, lane), jnp.where(found, other_s, s)
 
     _, lane, s = lax.while_loop(lambda carry: carry[0].any(), look, (lost, lane, s))
