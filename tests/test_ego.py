@@ -382,14 +382,14 @@ def test_who_crosses_a_line_at_the_end_of_the_lanes_stays_on_the_route():
     length, is_goal = np.asarray(lane_map.length), np.asarray(lane_map.routes.is_goal)
     cases = {}
     for over, beside in ((1, np.asarray(lane_map.left)), (-1, np.asarray(lane_map.right))):
-        for row in np.flatnonzero((beside >= 0) & ((parts[beside] >= 0).sum(-1) == 2)):
+        for row in np.flatnonzero((beside >= 0) & ((parts[beside] >= 0).sum(-1) == 2)).tolist():
             x, y, _ = pose(lane_map, row, length[row] + 0.5, 2.6 * over)
             own = parts[row][parts[row] >= 0]
             s, d, _ = to_frenet(lane_map, own, np.full(len(own), 0.5), x, y)
             if (np.abs(d) < np.asarray(width(lane_map, own, s)) / 2 + 0.15).any():
                 continue  # on a lane that its own leads to
             for goal in np.flatnonzero((after[row] >= 0) & (after[beside[row]] >= 0) & ~is_goal[row]):
-                cases[int(row), over, int(after[beside[row], goal])] = int(goal)
+                cases[row, over, int(after[beside[row], goal])] = int(goal)
     rows, over, onto = (list(column) for column in zip(*sorted(cases)[:N], strict=True))
     goals = [cases[case] for case in sorted(cases)[:N]]
     assert len(set(rows)) == N / 2, "from each onto two lanes, by the route alone"
