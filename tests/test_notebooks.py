@@ -63,6 +63,12 @@ class TestNotebook:
                 text += "".join(output.get("text", ()))
                 assert not _ABSOLUTE.search(text) and "Warning" not in text, text[:300]
 
+    def test_hides_false_alarms_before_jax_is_imported(self, path):
+        """What XLA writes about programs from its cache would be in the cells of every second run."""
+        first = source(code_cells(path)[0])
+        assert 'os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"' in first
+        assert "import" not in first.replace("import os\n", "", 1)
+
     def test_has_figures_with_captions(self, path):
         cells = json.loads(path.read_text())["cells"]
         pictures = sum("image/png" in out.get("data", {}) for c in code_cells(path) for out in c["outputs"])
