@@ -44,19 +44,19 @@ SLOWEST = 150  # s: a mutant may loop for ever
 
 TESTS = {
     "reductions": (
-        "metrics_reductions",
-        "metrics_scores",
-        "metrics_traffic",
-        "metrics_safety",
-        "metrics_episode",
+        "reductions",
+        "scores",
+        "traffic",
+        "safety",
+        "episode",
     ),
-    "safety": ("metrics_safety", "metrics_blame", "metrics_episode"),
-    "motion": ("metrics_motion", "metrics_episode"),
-    "blame": ("metrics_blame", "metrics_episode"),
-    "scores": ("metrics_scores", "metrics_episode"),
-    "traffic": ("metrics_traffic",),
-    "episode": ("metrics_episode",),
-    "intervals": ("metrics_intervals",),
+    "safety": ("safety", "blame", "episode"),
+    "motion": ("motion", "episode"),
+    "blame": ("blame", "episode"),
+    "scores": ("scores", "episode"),
+    "traffic": ("traffic",),
+    "episode": ("episode",),
+    "intervals": ("intervals",),
     "observer": ("observer",),
 }
 """The tests of each module, the nearest first."""
@@ -257,7 +257,7 @@ def survives(mutant: Mutant) -> bool:
     """Whether no test notices."""
     # forked from a process that has the slow imports behind it, but none of ours and no running JAX
     context = multiprocessing.get_context("forkserver")
-    tests = [f"tests/test_{name}.py" for name in TESTS[mutant.module]]
+    tests = [f"tests/metrics/test_{name}.py" for name in TESTS[mutant.module]]
     process = context.Process(target=_run, args=(mutant, tests))
     process.start()
     process.join(SLOWEST)

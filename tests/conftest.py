@@ -17,15 +17,13 @@ os.environ.setdefault(
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
-from beartype import BeartypeConf, beartype  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 
 # Shapes and types of these modules are checked in every call. Only modules of functions: the pytrees
 # that JAX rebuilds with placeholders inside would not pass.
-typecheck = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float
 _hooked = ["limsim_jax.numerics", "limsim_jax.geometry"]
 _hooked += [f"limsim_jax.maps.{name}" for name in ("conflicts", "routing", "signals")]
-install_import_hook(_hooked, "conftest.typecheck")
+install_import_hook(_hooked, "shape_checks.typecheck")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -33,14 +31,6 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 _programs = Path(tempfile.gettempdir()) / f"limsim-jax-tests-xla-{os.getuid()}"
 jax.config.update("jax_compilation_cache_dir", str(_programs))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-
-REPO = Path(__file__).resolve().parents[1]
-SHARED = Path(os.environ.get("LIMSIM_SHARED_DATA", REPO.parent / "shared" / "data"))
-"""Maps and recordings that are too large for the repository."""
-
-needs_shared = pytest.mark.skipif(
-    not SHARED.is_dir(), reason=f"no shared data at {SHARED}; set LIMSIM_SHARED_DATA to their folder"
-)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -1,0 +1,286 @@
+"""The page of a sweep: what it says, what it shows, and that it is one safe file."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_results import NAN, crashes, made
+
+from limsim_jax.report import page, tables
+from limsim_jax.report.page import write_report
+from limsim_jax.sweep.store import Results
+
+GROUP = ("highway", "like_traffic")
+
+
+class Checker(HTMLParser):
+    """Collects what a page loads and links, and that every tag is closed in turn."""
+
+    VOID = ("meta", "br", "img", "link", "input", "line", "circle", "!doctype")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.loads: list[str] = []
+        self.links: list[str] = []
+        self.ids: list[str] = []
+        self.tags: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        found = dict(attrs)
+        self.tags.append(tag)
+        self.loads += [found["src"]] if "src" in found else []
+        self.links += [found["href"]] if "href" in found else []
+        self.ids += [found["id"]] if "id" in found else []
+        assert not any(name.startswith("on") for name in found), tag
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: Any) -> None:
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag, f"</{tag}> closes something else"
+
+    def handle_data(self, data: str) -> None:
+        if not self.open or self.open[-1] not in ("style", "script"):
+            self.text += data
+
+
+def read(path) -> Checker:
+    checker = Checker()
+    checker.feed(path.read_text(encoding="utf-8"))
+    assert not checker.open
+    assert len(checker.ids) == len(set(checker.ids))
+    for link in checker.links:
+        assert not link.startswith("#") or link[1:] in checker.ids, link
+    return checker
+
+
+def thousand(n: int, seed: int = 0) -> Results:
+    """Two scenarios with all that the page draws."""
+    rng = np.random.default_rng(seed)
+    worlds = {}
+    for name in ("highway", "ramp"):
+        hit = rng.random(n) < 0.03
+        worlds[name, "like_traffic"] = {
+            "success": ~hit * 1,
+            "contacts": hit * 1,
+            "at_fault_contacts": hit * (rng.random(n) < 0.5),
+            "max_delta_v": np.where(hit, rng.gamma(2, 3, n), NAN),
+            "contact_responsibility": np.where(hit, rng.integers(1, 5, n), NAN),
+            "min_ttc": rng.gamma(3, 1, n),
+            "nuplan_score": rng.beta(8, 2, n),
+            "distance": rng.normal(900, 50, n),
+        }
+    return made(worlds)
+
+
+def test_the_page_says_what_the_tables_say(tmp_path):
+    results = crashes()
+    path = write_report(results, tmp_path / "deep" / "report.html")
+    assert sorted(x.name for x in path.parent.iterdir()) == ["report.html"]
+    checker = read(path)
+    text = " ".join(checker.text.split())
+    assert "4 of 8 episodes had a contact, 1 by the ego's fault (nuPlan's rules)." in text
+    assert "Worst crash: highway, seed 5" in text  # by delta-v, though it ranks behind who is at fault
+    assert "delta-v 9.0 m/s" in text
+    assert "limsim-jax replay results --seed 6" in text
+    assert "A reference planning module would have avoided it" in text
+    assert "Avoidable by the ego: yes; by the other vehicle: no" in text
+    row = tables.lookup(tables.summary(results))[*GROUP, "had_contact"]
+    assert tables.number_text(row["estimate"], row["lower"], row["upper"], 100).partition(" ")[2] in text
+    assert checker.loads == []
+    order = re.findall(r'<article class="card" id="highway-like_traffic-(\d)">', path.read_text())
+    assert order == ["6", "7", "5", "4", "3", "2"]
+
+
+def test_the_hardest_crash_is_always_shown(tmp_path):
+    path = write_report(crashes(), tmp_path / "report.html", worst=2)
+    order = re.findall(r'<article class="card" id="highway-like_traffic-(\d)">', path.read_text())
+    assert order == ["6", "5"]
+
+
+def test_without_contacts_the_bound_is_told(tmp_path):
+    path = write_report(made({GROUP: {"contacts": [0] * 59, "success": [1] * 59}}), tmp_path / "r.html")
+    text = " ".join(read(path).text.split())
+    assert "No contact in 59 episodes: with 95 % confidence it happens in less than 5 %." in text
+    assert "Worst crash" not in text
+
+
+def test_little_is_enough(tmp_path):
+    """One seed, one metric, no moments."""
+    path = write_report(made({GROUP: {"min_ttc": [NAN], "mean_speed": [3.0]}}), tmp_path / "r.html", worst=0)
+    assert "never measured" in read(path).text
+    with pytest.raises(ValueError, match="no finished episodes"):
+        write_report(Results(path, crashes().episodes.slice(0, 0), crashes().moments, {}, {}), path)
+
+
+def test_what_files_say_is_text(tmp_path):
+    """Names, provenance and labels cannot become markup, nor lead out of the folder."""
+    evil = "../<script>alert(1)</script>&\"'"
+    group = (f"s{evil}", f"p{evil}")
+    row = dict(scenario=group[0], policy=group[1], seed=1, rank=1, kind=evil, time=1.0, value=1.0,
+               responsible=evil, module=evil)  # fmt: skip
+    columns = {"contacts": [0, 1], "mean_speed": [1, 2], evil: [3, 4], "max_delta_v": [NAN, 3]}
+    facts: Any = {group: {evil: {evil: evil}, "x": evil}}
+    results = made({group: columns, GROUP: columns}, [row], provenance=facts, path=f"/tmp/{evil}")
+    results.units[evil] = evil
+    asked = []
+
+    def replayer(*key):
+        asked.append(key)
+        raise ValueError(evil)
+
+    path = write_report(results, tmp_path / "report.html", replayer=replayer, worst=2)
+    checker = read(path)
+    assert checker.tags.count("script") == 1
+    assert "<script>alert" not in path.read_text()
+    assert checker.text.count("No picture: ../<script>alert(1)</script>") == 2
+    assert (*group, 1) in asked
+    assert [x.name for x in tmp_path.iterdir()] == ["report.html"]
+    assert not page._file_name(group[0]).strip("abcdefghijklmnopqrstuvwxyz0123456789_")
+
+
+def test_the_page_does_not_grow_with_the_seeds(tmp_path):
+    few, many = (write_report(thousand(n), tmp_path / f"{n}.html") for n in (400, 4000))
+    assert "limsim-jax replay results --scenario ramp --seed" in many.read_text()
+    assert many.stat().st_size < 1.1 * few.stat().st_size < 300_000
+
+
+def test_curves_are_the_distribution():
+    """At every share the curve is at that order statistic."""
+    x = np.sort(np.random.default_rng(1).normal(5, 1, 1000))
+    drawn = re.search(r'points="([^"]*)"', page._curves([x], ["a"]))
+    assert drawn is not None
+    points = np.array([[float(v) for v in point.split(",")] for point in drawn[1].split()])
+    low, high = np.quantile(x, [0.002, 0.998])
+    share = (points[0, 1] - points[:, 1]) / (points[0, 1] - points[-1, 1])
+    _, to_x = page._axis(float(low), float(high), 44, 328)
+    for side in (-0.001, 0.001):  # a tenth of a pixel of the height
+        value = np.quantile(x, (share + side).clip(0, 1), method="inverted_cdf").clip(low, high)
+        assert (np.sign(side) * (np.array([to_x(v) for v in value]) - points[:, 0]) > -0.1).all()
+    assert (np.diff(points, axis=0) * (1, -1) >= 0).all()
+
+
+def test_ticks_are_round_and_within():
+    cases = (
+        (0, 1, ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"]),
+        (-7, 12, ["-5", "0", "5", "10"]),
+        (3.0, 3.0, ["2.8", "3.0", "3.2"]),
+        (900, 5200, None),
+    )
+    for low, high, expected in cases:
+        ticks, place = page._axis(low, high, 10, 110)
+        texts = [page._tick(t, ticks) for t in ticks]
+        assert expected is None or texts == expected
+        assert 3 <= len(ticks) <= 8
+        assert all(10 <= place(t) <= 110 for t in ticks)
+
+
+# --- with pictures
+
+
+def test_key_moments_are_pictured_and_replays_written(tmp_path):
+    """The ego's outline and the other one's ring are in both pictures, and links lead to files."""
+    pytest.importorskip("matplotlib")
+    from matplotlib.image import imread
+    from test_video import made as driven
+
+    from limsim_jax.report.video import EGO
+
+    network, lane_map, trace = driven("roundabout")
+    moments = [
+        dict(scenario=GROUP[0], policy=GROUP[1], seed=1, rank=1, kind="contact", time=0.9, other=3, value=4.0)
+    ]
+    columns = {
+        "contacts": [0, 1],
+        "max_delta_v": [NAN, 4.0],
+        "min_ttc": [2.0, 0.0],
+        "min_ttc_time": [77.0, 0.9],
+    }
+    results = made({GROUP: columns}, moments)
+    said, asked = [], []
+
+    def replayer(*key):
+        asked.append(key)
+        return network, lane_map, trace, 1, [], "more"
+
+    path = write_report(results, tmp_path / "report.html", replayer=replayer, say=said.append)
+    checker = read(path)
+    assert asked == [(*GROUP, 1), (*GROUP, 0)]
+    assert said[0] == "replay 1 of 2: highway, like_traffic, seed 1"
+    links = {link for link in checker.links if not link.startswith("#")}
+    assert links == {"replays/highway-like_traffic-1.html", "replays/highway-like_traffic-0.html"}
+    assert all((tmp_path / link).stat().st_size > 1000 for link in links)
+    assert "0.8 s before" in path.read_text() and "at 0.9 s" in path.read_text()
+    images = [imread(BytesIO(base64.b64decode(x.partition(",")[2]))) for x in checker.loads]
+    assert len(images) == 4 and all(x.startswith("data:image/png;base64,") for x in checker.loads)
+
+    def height(image, color: str) -> int:
+        """Of what has the color, in pixels."""
+        rgb = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        rows = np.argwhere(np.abs(image[..., :3] - rgb).max(-1) < 0.02)[:, 0]
+        return int(np.ptp(rows)) if rows.size else 0
+
+    assert all(height(image, EGO) > 10 for image in images)
+    # a ring of 61 pixels, and a name below it
+    assert [height(image, page._OTHER) > 60 for image in images] == [True, True, False, False]
+
+
+def test_the_view_holds_both_and_times_outside_the_trace_are_its_ends():
+    pytest.importorskip("matplotlib")
+    from test_video import made as driven
+
+    network, lane_map, trace = driven("roundabout")
+    views = page.pictures(network, lane_map, trace, ego=1, time=1e3, other=99)
+    assert [caption for caption, _ in views] == ["1.1 s before", "at 1.2 s"]
+    with pytest.raises(ValueError, match="slot 9"):
+        page.pictures(network, lane_map, trace, ego=9, time=0.5)
+    gone = trace._replace(active=trace.active & (np.arange(12)[:, None] < 7))
+    views = page.pictures(network, lane_map, gone, ego=1, time=1.1)
+    assert views[-1][0] == "at 0.7 s"  # when the ego was there last
+
+
+def test_in_a_browser(tmp_path):
+    """The script runs, tables can be sorted, and nothing is wider than a phone but what scrolls."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        pytest.skip("needs Chromium")
+    path = write_report(thousand(200), tmp_path / "report.html")
+    probe = """<script>
+    const page = document.querySelector("iframe");
+    page.onload = () => {
+      const inner = page.contentDocument, table = inner.querySelector("table.sortable");
+      const seeds = () => [...table.tBodies[0].rows].map(row => +row.cells[2].textContent);
+      const heads = table.tHead.rows[0].cells;
+      heads[2].querySelector("button").click(); const up = seeds().join();
+      heads[2].querySelector("button").click(); const down = seeds().join();
+      heads[6].querySelector("button").click();
+      document.title = JSON.stringify({width: inner.documentElement.scrollWidth, up, down,
+        ttc: [...table.tBodies[0].rows].map(row => row.cells[6].dataset.value).join()});
+    };</script>"""
+    source = path.read_text().replace("&", "&amp;").replace('"', "&quot;")
+    frame = f'<iframe srcdoc="{source}" style="width: 390px; height: 800px; border: 0"></iframe>'
+    (tmp_path / "phone.html").write_text(f"<!doctype html><title></title>{frame}{probe}", encoding="utf-8")
+    dumped = subprocess.run(
+        [chromium, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
+         "--virtual-time-budget=3000", "--dump-dom", (tmp_path / "phone.html").as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    ).stdout  # fmt: skip
+    found = re.search(r"<title>(\{.*?\})</title>", dumped, re.S)
+    assert found is not None, dumped[:500]
+    told = json.loads(found[1])
+    seeds = [int(x) for x in told["up"].split(",")]
+    assert seeds == sorted(seeds) and told["down"].split(",") == [str(x) for x in sorted(seeds, reverse=True)]
+    ttc = [float(x) for x in told["ttc"].split(",")]
+    assert ttc == sorted(ttc) and len(ttc) == page.LISTED
+    assert told["width"] <= 390

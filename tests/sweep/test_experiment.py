@@ -1,0 +1,188 @@
+"""Experiment files: what they say, and what is said of wrong ones. Nothing here compiles a world."""
+
+import jax
+import numpy as np
+import pytest
+from paths import REPO
+from traffic_worlds import bundled
+
+from limsim_jax.maps.lane_map import lane_ids
+from limsim_jax.sweep.episode import Episodes
+from limsim_jax.sweep.experiment import ExperimentError, bundled_experiments, read_experiments
+
+GOOD = """
+map = "intersection"
+horizon = 20.0
+slots = 32
+[ego]
+start = "6-"
+s = 60.0
+goal = "2"
+[traffic]
+vehicles = 6
+[[traffic.flow]]
+rate = 300
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text: str, name: str = "mine.toml"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_bundled_experiments_are_the_paper_s_five():
+    known = bundled_experiments()
+    assert set(known) == {"highway", "ramp", "intersection", "roundabout", "long_route", "paper", "town"}
+    assert known["paper"].parent == REPO / "experiments"
+    paper = read_experiments("paper")
+    assert [one.name for one in paper] == ["highway", "ramp", "intersection", "roundabout", "long_route"]
+    assert all(one.map == one.name and one.policy == "like_traffic" for one in paper)
+
+
+@pytest.mark.parametrize("name", ["highway", "ramp", "intersection"])
+def test_the_ego_starts_where_the_file_says_and_nobody_is_on_top_of_it(name):
+    (experiment,) = read_experiments(name)
+    episodes = Episodes(experiment)
+    network, _ = bundled(name)
+    scenario = jax.jit(jax.vmap(episodes.sample))(jax.random.split(jax.random.key(1), 8))
+    start = jax.device_get(scenario.start)
+    ids = lane_ids(network)
+    lane = network.lanes[ids[start.lane[0, 0]]]
+    assert lane.road == experiment.ego.start.rstrip("+-")
+    assert (start.egos.slot == 0).all() and start.active[:, 0].all()
+    np.testing.assert_allclose(start.s[:, 0], experiment.ego.s, rtol=1e-6)
+    assert (start.v[:, 0] > 3).all(), "it starts in motion"
+    same = start.active[:, 1:] & (start.lane[:, 1:] == start.lane[:, :1])
+    front, rear = start.s[:, 1:], start.s[:, 1:] - start.shape.length[:, 1:]
+    apart = (rear > start.s[:, :1] + 9.9) | (front < start.s[:, :1] - start.shape.length[:, :1] - 9.9)
+    assert apart[same].all(), "others keep off"
+    assert same.any() or name != "highway", "though they are on the same lane"
+    assert len({float(x) for x in start.v.sum(-1)}) == 8, "worlds differ"
+    assert (start.active.sum(-1) == (experiment.traffic.vehicles or 0) + 1).all()
+
+
+def test_an_ego_with_a_random_start_is_elsewhere_in_every_world(write):
+    text = GOOD.replace('start = "6-"\ns = 60.0\ngoal = "2"', 'start = "random"')
+    (experiment,) = read_experiments(write(text))
+    episodes = Episodes(experiment)
+    start = jax.device_get(jax.jit(jax.vmap(episodes.sample))(jax.random.split(jax.random.key(1), 8)).start)
+    assert len({(int(a), float(b)) for a, b in zip(start.lane[:, 0], start.s[:, 0], strict=True)}) == 8
+    assert (start.active.sum(-1) == 6).all(), "the ego is one of those at the start"
+    assert (start.shape.length[:, 0] == start.shape.length[0, 0]).all(), "but always the same car"
+
+
+def test_other_map_and_policy(write):
+    path = write(
+        GOOD.replace('goal = "2"', 'goal = "2"\noptions = { speed = 3.0 }\npolicy = "constant_speed"')
+    )
+    (experiment,) = read_experiments(path)
+    assert (experiment.policy, experiment.ego.options) == ("constant_speed", {"speed": 3.0})
+    (other,) = read_experiments(path, policy="like_traffic", map_file="roundabout")
+    assert (other.policy, other.ego.options, other.map) == ("like_traffic", {}, "roundabout")
+    (same,) = read_experiments(path, policy="constant_speed")
+    assert same.ego.options == {"speed": 3.0}
+    (own,) = read_experiments(path, policy="limsim_jax.policies.simple:ConstantSpeed")
+    assert own.policy == "ConstantSpeed" and Episodes(own).policy == "ConstantSpeed"
+
+
+WRONG = {  # what to replace, by what, and the message
+    "a mistyped field that is needed": (
+        "horizon =",
+        "horizn =",
+        "horizn: no such field; known are name, map, horizon",
+    ),
+    "an unknown field": ("slots = 32", "slotz = 32", "slotz: no such field; known are name, map, horizon"),
+    "an unknown field in a table": ("rate = 300", "rate = 300\nspede = 3", "traffic.flow.0.spede: no such"),
+    "a missing field": ("horizon = 20.0\n", "", "horizon: Field required"),
+    "a wrong type": ("horizon = 20.0", 'horizon = "20 s"', "horizon: .*number, not '20 s'"),
+    "a horizon of nothing": ("horizon = 20.0", "horizon = 0.0", "horizon: .*greater than 0, not 0.0"),
+    "an infinite rate": ("rate = 300", "rate = inf", "traffic.flow.0.rate: .*finite"),
+    "a negative rate": (
+        "rate = 300",
+        "rate = -5",
+        "rate: .*greater than or equal to 0, not -5",
+    ),
+    "no such map": ('"intersection"', '"nowhere"', "map: .*nowhere.*bundled maps are highway"),
+    "no such goal": ('goal = "2"', 'goal = "99"', "ego.goal: no goal or lane '99'; goals are 2, 4"),
+    "a goal that is not reached": (
+        'goal = "2"',
+        'goal = "6+"',
+        "ego.goal: '6\\+' cannot be reached",
+    ),
+    "no goal": ('goal = "2"', "", "ego: a goal is missing"),
+    "no such start": (
+        'start = "6-"',
+        'start = "x"',
+        "no entry, road or lane 'x'; entries are 1, 3",
+    ),
+    "a lane too many": ("s = 60.0", "s = 60.0\nlane = 7", "ego.lane: 7, but '6-' has lanes 0 to 1"),
+    "a place beyond the lane": ("s = 60.0", "s = 6000.0", "ego.s: 6000 m, but lane '6_0_-2' is only 20"),
+    "too few slots": ("slots = 32", "slots = 4", "slots: 4, but 7 vehicles are there at the start"),
+    "no such policy": (
+        'goal = "2"',
+        'goal = "2"\npolicy = "best"',
+        "ego.policy: unknown policy 'best'",
+    ),
+    "no such module": (
+        'goal = "2"',
+        'goal = "2"\npolicy = "no_such:thing"',
+        "'no_such:thing' cannot be",
+    ),
+    "a wrong option": (
+        'goal = "2"',
+        'goal = "2"\npolicy = "constant_speed"\noptions = { speed = -1.0 }',
+        "ego.options: speed: -1.0 m/s",
+    ),
+    "no such option": (
+        'goal = "2"',
+        'goal = "2"\npolicy = "constant_speed"\noptions = { sped = 1.0 }',
+        "ego.options: sped: no such option; there are speed",
+    ),
+    "no such option of the planner around": (
+        'goal = "2"',
+        'goal = "2"\npolicy = "area_of_interest"\noptions = { options = { share = 1.0 } }',
+        "ego.options: share: no such option; there are .*search",
+    ),
+    "no such metric": (
+        "horizon = 20.0",
+        "horizon = 20.0\nsuccess = { goodness = 1 }",
+        "success.goodness: no such",
+    ),
+    "no such driver": ('goal = "2"', 'goal = "2"\ndriver = { tau = 1.0 }', "ego: .*'tau'"),
+    "no such origin": ("rate = 300", 'rate = 300\norigin = "77"', "traffic: .*'77'"),
+    "two numbers of vehicles": (
+        "vehicles = 6",
+        "vehicles = 6\ndensity = 2.0",
+        "vehicles or density",
+    ),
+    "no TOML": ("slots = 32", "slots = = 32", "not valid TOML"),
+}
+
+
+@pytest.mark.parametrize("old, new, message", WRONG.values(), ids=WRONG)
+def test_what_is_wrong_is_named_in_one_line(write, old, new, message):
+    assert old in GOOD
+    path = write(GOOD.replace(old, new))
+    with pytest.raises(ExperimentError, match=message) as caught:
+        for experiment in read_experiments(path):
+            Episodes(experiment)
+    text = str(caught.value)
+    assert "\n" not in text and "mine" in text
+
+
+def test_lists_of_experiments(write):
+    write(GOOD, "one.toml")
+    write(GOOD.replace("20.0", "30.0"), "two.toml")
+    both = read_experiments(write('experiments = ["one.toml", "two.toml"]', "both.toml"))
+    assert [(one.name, one.horizon) for one in both] == [("one", 20.0), ("two", 30.0)]
+    with pytest.raises(ExperimentError, match="two experiments are named 'one'"):
+        read_experiments(write('experiments = ["one.toml", "one.toml"]', "twice.toml"))
+    with pytest.raises(ExperimentError, match=r"next to 'experiments'.*not horizon"):
+        read_experiments(write('experiments = ["one.toml"]\nhorizon = 2.0', "more.toml"))
+    with pytest.raises(ExperimentError, match="no such file, and no bundled experiment"):
+        read_experiments("nothing_of_the_kind")
