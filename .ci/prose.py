@@ -29,7 +29,7 @@ SENTENCE = 30
 
 RULES = {
     "who without a noun": re.compile(
-        r"(?<!for )(?<!says )(?<!saying )(?<!say )(?<!tells )(?<!see )\bwho\b|\bwhoever\b|\bwho(?:se|m) (?:turn|way) it\b",
+        r"(?<!says )(?<!saying )(?<!say )(?<!decides )\bwho\b|\bwhoever\b",
         re.I,
     ),
     "a person where a vehicle is meant": re.compile(r"\b(?:some|no|every|any)body\b", re.I),
