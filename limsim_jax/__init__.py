@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from limsim_jax.traffic.vehicles import fitting as fitting
     from limsim_jax.types import Config as Config
 
-__version__ = "0.1.0.dev0"
+__version__ = "0.1.0"
 
 _HOMES = {
     "Config": "limsim_jax.types",
