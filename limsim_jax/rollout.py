@@ -103,12 +103,12 @@ class Measure(Protocol):
         """The carry at the start."""
         ...
 
-    def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
+    def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
         """What `update` needs to know of a physics step."""
         ...
 
-    def update(self, config: Config, lane_map: LaneMap, carry: Any, looks: Any) -> Any:
-        """The carry after a decision and its physics steps, `looks` `[decision_every, ...]`."""
+    def update(self, config: Config, lane_map: LaneMap, carry: Any, records: Any) -> Any:
+        """The carry after a decision and its physics steps, `records` `[decision_every, ...]`."""
         ...
 
     def result(self, config: Config, lane_map: LaneMap, carry: Any) -> Any:
@@ -256,17 +256,17 @@ class Rollout:
 
         def record(tick: Tick) -> tuple[Any, Any]:
             kept = None if trace is None else trace(tick)
-            return kept, None if measure is None else measure.look(config, lane_map, tick)
+            return kept, None if measure is None else measure.record(config, lane_map, tick)
 
         def decide(carry: Carry, _: None) -> tuple[Carry, Any]:
             state, memory, totals, stood, measured = carry
             now = jax.random.fold_in(key, state.step)
             command, memory = self.policy(config, lane_map, state, memory, now)
-            after, (kept, looks) = drive(
+            after, (kept, records) = drive(
                 config, self.traffic, lane_map, state, schedule, command, record, free=self._free
             )
             if measure is not None:
-                measured = measure.update(config, lane_map, measured, looks)
+                measured = measure.update(config, lane_map, measured, records)
             totals, stood = count(config, totals, stood, state, after)
             new = Carry(after, memory, totals, stood, measured)
             if self.traffic.after_collision == "end":

@@ -1,6 +1,6 @@
-"""From the engine to the metrics: `EvaluateEgo` shows the first ego and the traffic to their judges.
+"""From the engine to the metrics: `EvaluateEgo` shows the first ego and the traffic to their metrics.
 
-A `Look` is what a physics step leaves behind; after every decision its looks go through the metrics.
+A `StepRecord` is what a physics step leaves behind; after every decision its records go through the metrics.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _STANDS = 0.5  # m/s
 _ON_LINE = 0.5  # m beyond the stop line from which who starts does not cross it
 
 
-class Look(NamedTuple):
+class StepRecord(NamedTuple):
     """A world after a physics step: `N` slots, `Z` conflict zones near the ego."""
 
     ego: EgoStep
@@ -43,7 +43,7 @@ class Look(NamedTuple):
     stopped: Bool[Array, ""]  # the ego has stopped at the stop sign ahead
 
 
-class Judged(NamedTuple):
+class MetricState(NamedTuple):
     """State of `EvaluateEgo`."""
 
     ego: EgoCarry
@@ -64,17 +64,17 @@ class EvaluateEgo:
 
     rss: Rss = field(default_factory=Rss)
 
-    def _judges(self, config: Config) -> tuple[EgoMetrics, TrafficMetrics]:
+    def _metrics(self, config: Config) -> tuple[EgoMetrics, TrafficMetrics]:
         return EgoMetrics(config.dt, self.rss), TrafficMetrics(config.dt)
 
-    def init(self, config: Config, lane_map: LaneMap, state: State) -> Judged:
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> MetricState:
         """Everything as it is at the start."""
-        ego, traffic = self._judges(config)
+        ego, traffic = self._metrics(config)
         slots, slot = state.lane.shape[0], state.egos.slot[0]
         nothing = jnp.zeros(slots, jnp.float32)
         nobody = state.active & False
-        first = _look(lane_map, state, nobody, nobody, jnp.zeros((), jnp.float32), nothing)
-        carry = Judged(
+        first = _record(lane_map, state, nobody, nobody, jnp.zeros((), jnp.float32), nothing)
+        carry = MetricState(
             ego=ego.init(slots, first.ego.zones.id.shape[0]),
             traffic=traffic.init(slots, 0),
             goal=state.goal[slot],
@@ -84,41 +84,48 @@ class EvaluateEgo:
         )
         return self._step(config, lane_map, carry, first, jnp.ones(slots, bool))
 
-    def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Look:
+    def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> StepRecord:
         """What the metrics need to know of a physics step."""
         off = tick.off_road
         if off is None:
             off = off_road(lane_map, tick.state, boxes(lane_map, tick.state))
-        look = _look(lane_map, tick.state, tick.left, off, tick.time, tick.dx)
+        record = _record(lane_map, tick.state, tick.left, off, tick.time, tick.dx)
         slot = tick.state.egos.slot[0]
         other, gap = (x[slot, 0] for x in tick.decision.obstacles)
         gap = gap + tick.x[other] - tick.x[slot]
         ahead = (other >= 0) & tick.state.active[other]
-        ego = look.ego._replace(
+        ego = record.ego._replace(
             lead=jnp.where(ahead, other, -1), lead_gap=jnp.where(ahead, jnp.maximum(gap, 0), NO_GAP)
         )
-        return look._replace(
-            ego=ego, traffic=look.traffic._replace(v_free=tick.decision.v0), way=tick.decision.way
+        return record._replace(
+            ego=ego, traffic=record.traffic._replace(v_free=tick.decision.v0), way=tick.decision.way
         )
 
-    def update(self, config: Config, lane_map: LaneMap, carry: Judged, looks: Look) -> Judged:
-        """Pass the looks since the last decision through the metrics."""
-        relevant = _meets_ego(lane_map, looks.ego.slot[0], looks.way[0], looks.other.max(0))
+    def update(
+        self, config: Config, lane_map: LaneMap, carry: MetricState, records: StepRecord
+    ) -> MetricState:
+        """Pass the records since the last decision through the metrics."""
+        relevant = _meets_ego(lane_map, records.ego.slot[0], records.way[0], records.other.max(0))
 
-        def step(carry: Judged, look: Look) -> tuple[Judged, None]:
-            return self._step(config, lane_map, carry, look, relevant), None
+        def step(carry: MetricState, record: StepRecord) -> tuple[MetricState, None]:
+            return self._step(config, lane_map, carry, record, relevant), None
 
-        return lax.scan(step, carry, looks)[0]
+        return lax.scan(step, carry, records)[0]
 
     def _step(
-        self, config: Config, lane_map: LaneMap, carry: Judged, look: Look, relevant: Bool[Array, " N"]
-    ) -> Judged:
-        ego, traffic = self._judges(config)
-        seen, slot = look.ego, look.ego.slot
-        lane, s = look.traffic.lane[slot], look.traffic.s[slot]
+        self,
+        config: Config,
+        lane_map: LaneMap,
+        carry: MetricState,
+        record: StepRecord,
+        relevant: Bool[Array, " N"],
+    ) -> MetricState:
+        ego, traffic = self._metrics(config)
+        seen, slot = record.ego, record.ego.slot
+        lane, s = record.traffic.lane[slot], record.traffic.s[slot]
         routes = lane_map.routes
         # who leaves the map is on no lane any more
-        leaves = look.traffic.left[slot] & routes.is_goal[carry.lane, carry.goal]
+        leaves = record.traffic.left[slot] & routes.is_goal[carry.lane, carry.goal]
         on_route = routes.reachable[lane, carry.goal]
         reached = seen.arrived & routes.is_goal[lane, carry.goal]
         to_go = jnp.where(on_route, routes.distance[lane, carry.goal] - s, carry.to_go)
@@ -130,35 +137,35 @@ class EvaluateEgo:
             arrived=leaves | reached,
             stop_sign=seen.stop_sign & ~carry.stopped,
         )
-        handed_over = look.traffic.s <= look.traffic.dx
-        changed = look.traffic.active & carry.traffic.active & (look.traffic.lane != carry.traffic.lane)
+        handed_over = record.traffic.s <= record.traffic.dx
+        changed = record.traffic.active & carry.traffic.active & (record.traffic.lane != carry.traffic.lane)
         none = Detectors(jnp.zeros(0, jnp.int32), jnp.zeros(0, jnp.float32))
-        flow = look.traffic._replace(changed=changed & ~handed_over)
-        return Judged(
+        flow = record.traffic._replace(changed=changed & ~handed_over)
+        return MetricState(
             ego=ego.update(carry.ego, seen),
             traffic=traffic.update(carry.traffic, none, flow),
             goal=carry.goal,
             lane=jnp.where(lane == NO_LANE, carry.lane, lane),
-            stopped=((lane == carry.lane) & carry.stopped) | look.stopped,
+            stopped=((lane == carry.lane) & carry.stopped) | record.stopped,
             to_go=to_go,
         )
 
-    def result(self, config: Config, lane_map: LaneMap, carry: Judged) -> dict[str, Measured]:
+    def result(self, config: Config, lane_map: LaneMap, carry: MetricState) -> dict[str, Measured]:
         """All of `episode.NAMES`, and of the traffic with `traffic_` in front."""
-        ego, traffic = self._judges(config)
+        ego, traffic = self._metrics(config)
         length = jnp.sum(jnp.where(lane_map.valid, lane_map.length, 0))
         flow = traffic.result(carry.traffic, length)
         return ego.result(carry.ego) | {f"traffic_{name}": value for name, value in flow.items()}
 
 
-def _look(
+def _record(
     lane_map: LaneMap,
     state: State,
     left: Bool[Array, " N"],
     off: Bool[Array, " N"],
     t: Float[Array, ""],
     dx: Float[Array, " N"],
-) -> Look:
+) -> StepRecord:
     """All that needs no memory; who leads the ego, and where it wants to go, is filled in later."""
     slot = state.egos.slot[0]
     box = boxes(lane_map, state)
@@ -224,7 +231,7 @@ def _look(
         others=count > 0,
         zones=_zones(lane_map, state, slot, following),
     )
-    return Look(
+    return StepRecord(
         ego=ego,
         traffic=TrafficStep(
             t=t,

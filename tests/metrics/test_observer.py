@@ -18,7 +18,7 @@ from traffic_worlds import bundled, drivers, shapes
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, elevation, pose, width
 from limsim_jax.maps.signals import SignalState, lane_states
-from limsim_jax.metrics.observer import EvaluateEgo, Look, _meets_ego
+from limsim_jax.metrics.observer import EvaluateEgo, StepRecord, _meets_ego
 from limsim_jax.metrics.safety import NO_GAP
 from limsim_jax.metrics.traffic import TrafficMetrics, TrafficStep
 from limsim_jax.traffic.collision import off_road
@@ -206,25 +206,27 @@ def random_tick(rng, slot: int, lane: int | None = None) -> Tick:
 
 
 @functools.cache
-def seen() -> list[tuple[Tick, Look]]:
+def seen() -> list[tuple[Tick, StepRecord]]:
     """Random steps and what is seen of them, in NumPy."""
     rng = np.random.default_rng(3)
     ticks = [random_tick(rng, int(rng.integers(N))) for _ in range(WORLDS)]
-    return list(zip(ticks, looks_at(ticks), strict=True))
+    return list(zip(ticks, records_of(ticks), strict=True))
 
 
 @jax.jit
-def _looks(lane_map, ticks):
-    return jax.vmap(lambda tick: EvaluateEgo().look(CONFIG, lane_map, tick))(ticks)
+def _records(lane_map, ticks):
+    return jax.vmap(lambda tick: EvaluateEgo().record(CONFIG, lane_map, tick))(ticks)
 
 
-def looks_at(ticks):
+def records_of(ticks):
     size = 50  # of a batch: one program
     parts = []
     for begin in range(0, len(ticks), size):
         part = ticks[begin : begin + size]
-        looks = jax.tree.map(np.asarray, _looks(crossing(), stacked(part + part[:1] * (size - len(part)))))
-        parts += [jax.tree.map(lambda x, i=i: x[i], looks) for i in range(len(part))]
+        records = jax.tree.map(
+            np.asarray, _records(crossing(), stacked(part + part[:1] * (size - len(part))))
+        )
+        parts += [jax.tree.map(lambda x, i=i: x[i], records) for i in range(len(part))]
     return parts
 
 
@@ -254,14 +256,14 @@ def given():
 
 def each(name: str) -> Iterator[Any]:
     """Of all random steps: number, state, step, slot of the ego, and what is said of it under a name."""
-    for i, (tick, look) in enumerate(seen()):
-        yield i, tick.state, tick, int(tick.state.egos.slot[0]), getattr(look.ego, name)
+    for i, (tick, record) in enumerate(seen()):
+        yield i, tick.state, tick, int(tick.state.egos.slot[0]), getattr(record.ego, name)
 
 
 def test_plain_columns_are_those_of_the_state():
-    for i, (tick, look) in enumerate(seen()):
+    for i, (tick, record) in enumerate(seen()):
         state, slot = tick.state, int(tick.state.egos.slot[0])
-        ego, traffic = look.ego, look.traffic
+        ego, traffic = record.ego, record.traffic
         assert ego.t == tick.time == traffic.t
         assert ego.slot == slot and ego.v == state.v[slot] and ego.a == state.a[slot]
         assert ego.rear_axle == pytest.approx(0.5 * state.shape.wheelbase[slot])
@@ -272,22 +274,22 @@ def test_plain_columns_are_those_of_the_state():
         np.testing.assert_array_equal(traffic.v_free, tick.decision.v0)
         np.testing.assert_array_equal(traffic.left, tick.left)
         assert traffic.inside.all() and not traffic.changed.any()
-        np.testing.assert_array_equal(look.way, tick.decision.way)
-        np.testing.assert_array_equal(look.other, given()[i][3])
-        assert look.stopped == state.stopped[slot] and ego.off_road == np.asarray(tick.off_road)[slot]
+        np.testing.assert_array_equal(record.way, tick.decision.way)
+        np.testing.assert_array_equal(record.other, given()[i][3])
+        assert record.stopped == state.stopped[slot] and ego.off_road == np.asarray(tick.off_road)[slot]
 
 
 def test_bodies_and_who_is_on_the_same_level():
     there = 0
-    for i, (tick, look) in enumerate(seen()):
+    for i, (tick, record) in enumerate(seen()):
         box, z, *_ = given()[i]
         state, slot = tick.state, int(tick.state.egos.slot[0])
-        np.testing.assert_allclose(look.ego.box, box, atol=1e-4)
+        np.testing.assert_allclose(record.ego.box, box, atol=1e-4)
         for k in range(N):
             v = state.v[k] * np.array([np.cos(box[k, 2]), np.sin(box[k, 2])])
-            np.testing.assert_allclose(look.ego.velocity[k], v, atol=1e-4)
-            assert look.ego.active[k] == (state.active[k] and abs(z[k] - z[slot]) < 3.0)
-            there += state.active[k] and not look.ego.active[k]
+            np.testing.assert_allclose(record.ego.velocity[k], v, atol=1e-4)
+            assert record.ego.active[k] == (state.active[k] and abs(z[k] - z[slot]) < 3.0)
+            there += state.active[k] and not record.ego.active[k]
     assert there > 100
 
 
@@ -469,13 +471,13 @@ def with_foes(count: int) -> LaneMap:
 
 
 def test_maps_where_paths_hardly_or_never_meet():
-    look = jax.jit(lambda lane_map, tick: EvaluateEgo().look(CONFIG, lane_map, tick).ego.zones)
-    never = jax.tree.map(np.asarray, look(with_foes(0), seen()[0][0]))
+    record = jax.jit(lambda lane_map, tick: EvaluateEgo().record(CONFIG, lane_map, tick).ego.zones)
+    never = jax.tree.map(np.asarray, record(with_foes(0), seen()[0][0]))
     assert never.id.tolist() == [-1] and not never.ego.any() and not never.other.any()
     assert never.id.shape == never.ego.shape == never.other.shape
     met = 0
     for tick, all_of_them in seen()[:60]:
-        one = jax.tree.map(np.asarray, look(with_foes(1), tick))
+        one = jax.tree.map(np.asarray, record(with_foes(1), tick))
         first = jax.tree.map(lambda x: x.reshape(3, -1)[:, 0], all_of_them.ego.zones)
         np.testing.assert_array_equal(one.id >= 0, first.id >= 0)
         np.testing.assert_array_equal(one.ego, first.ego)
@@ -485,10 +487,10 @@ def test_maps_where_paths_hardly_or_never_meet():
 
 
 def test_who_is_off_the_road_is_looked_for_where_the_engine_did_not():
-    look = jax.jit(lambda tick: EvaluateEgo().look(CONFIG, crossing(), tick._replace(off_road=None)))
+    record = jax.jit(lambda tick: EvaluateEgo().record(CONFIG, crossing(), tick._replace(off_road=None)))
     found = []
     for (tick, _), (*_, off) in zip(seen()[:25], given()[:25], strict=True):
-        ego = look(tick).ego
+        ego = record(tick).ego
         found += [bool(ego.off_road)]
         assert ego.off_road == off[tick.state.egos.slot[0]]
         assert np.asarray(ego.changing)[off].all()
@@ -555,7 +557,7 @@ class Watched(EvaluateEgo):
         object.__setattr__(self, "pair", (ego, traffic))
         return self
 
-    def _judges(self, config):
+    def _metrics(self, config):
         return self.pair
 
 
@@ -585,19 +587,19 @@ def stories():
                 following = int(m.routes.next_lane[at, int(state.goal[slot])])
                 goes_on = following if following != NO_LANE else at
                 lane = [at, at, goes_on, None][rng.integers(4)]
-        told.append((slot, ticks, looks_at(ticks)))
+        told.append((slot, ticks, records_of(ticks)))
     return told
 
 
-def play(slot, ticks, looks, judge):
+def play(slot, ticks, records, judge):
     """What the judges were shown: at the start, and over two decisions of the rest."""
     ego, traffic = Recorder(), Recorder(judge)
     watch = Watched().judge(ego, traffic)
     with jax.disable_jit():
         carry = watch.init(CONFIG, crossing(), jax.tree.map(jnp.asarray, ticks[0].state))
         carries = [carry]
-        half = len(looks) // 2
-        for part in (looks[:half], looks[half:]):
+        half = len(records) // 2
+        for part in (records[:half], records[half:]):
             together = jax.tree.map(jnp.asarray, stacked(part))
             carry = watch.update(CONFIG, crossing(), carry, together)
             carries.append(carry)
@@ -607,15 +609,15 @@ def play(slot, ticks, looks, judge):
 def test_progress_arrival_and_signs_over_time():
     m = host()
     totals = dict.fromkeys(("arrived", "left", "lost", "signs", "pardoned", "changed", "new goal"), 0)
-    for slot, ticks, looks in stories():
-        carries, ego, traffic = play(slot, ticks, looks, Seats())
+    for slot, ticks, records in stories():
+        carries, ego, traffic = play(slot, ticks, records, Seats())
         start = ticks[0].state
         goal = start.goal[slot]
         was, stopped, to_go = start.lane[slot], False, 0.0
-        half = len(looks) // 2
+        half = len(records) // 2
         before: Any = None
-        look: Any = None
-        assert len(ego.shown) == len(looks) + 1
+        record: Any = None
+        assert len(ego.shown) == len(records) + 1
         for t, step in enumerate(ego.shown):
             flow = traffic.shown[t]
             if t == 0:  # the start: nobody has moved or left
@@ -624,7 +626,7 @@ def test_progress_arrival_and_signs_over_time():
                 assert not step.stop_sign and step.lead == -1 and step.lead_gap == NO_GAP
                 np.testing.assert_array_equal(step.relevant, True)
             else:
-                tick, look = ticks[t - 1], looks[t - 1]
+                tick, record = ticks[t - 1], records[t - 1]
                 state, left, dx = tick.state, tick.left, tick.dx
             lane, s = state.lane[slot], state.s[slot]
             on_route = bool(m.routes.reachable[lane, goal]) if lane != NO_LANE else False
@@ -639,9 +641,9 @@ def test_progress_arrival_and_signs_over_time():
             assert step.on_route == on_route and step.arrived == (leaves or reached)
             assert step.to_go == pytest.approx(to_go, rel=1e-5, abs=1e-4)
             if t:
-                assert step.stop_sign == (look.ego.stop_sign and not stopped)
+                assert step.stop_sign == (record.ego.stop_sign and not stopped)
                 totals["signs"] += bool(step.stop_sign)
-                totals["pardoned"] += bool(look.ego.stop_sign and stopped)
+                totals["pardoned"] += bool(record.ego.stop_sign and stopped)
             stopped = bool(state.stopped[slot]) or (stopped and lane == was)
             for k in range(N) if t else ():
                 both = state.active[k] and before.active[k] and state.lane[k] != before.lane[k]
@@ -654,15 +656,15 @@ def test_progress_arrival_and_signs_over_time():
             if lane != NO_LANE:
                 was = lane
             before = state
-            index = {0: 0, half: 1, len(looks): 2}.get(t)
+            index = {0: 0, half: 1, len(records): 2}.get(t)
             if index is not None:
                 found = carries[index]
                 assert found.goal == goal and found.lane == was and bool(found.stopped) == stopped
                 assert found.to_go == pytest.approx(to_go, rel=1e-5, abs=1e-4)
         for number, begin in ((1, 1), (2, half + 1)):
-            first = looks[begin - 1]
-            end = half if number == 1 else len(looks)
-            other = np.max([look.other for look in looks[begin - 1 : end]], 0)
+            first = records[begin - 1]
+            end = half if number == 1 else len(records)
+            other = np.max([record.other for record in records[begin - 1 : end]], 0)
             expected = _meets_ego(
                 crossing(), jnp.int32(slot), jnp.asarray(first.way), jnp.asarray(other, jnp.int32)
             )
@@ -672,16 +674,16 @@ def test_progress_arrival_and_signs_over_time():
 
 
 def test_the_judges_get_the_time_step_and_as_many_slots_as_there_are():
-    slot, ticks, looks = stories()[0]
-    _, ego, traffic = play(slot, ticks, looks, Seats())
-    assert ego.sizes == (N, looks[0].ego.zones.id.size) and traffic.sizes == (N, 0)
-    judges = EvaluateEgo()._judges(Config(dt=0.05))
+    slot, ticks, records = stories()[0]
+    _, ego, traffic = play(slot, ticks, records, Seats())
+    assert ego.sizes == (N, records[0].ego.zones.id.size) and traffic.sizes == (N, 0)
+    judges = EvaluateEgo()._metrics(Config(dt=0.05))
     assert [judge.dt for judge in judges] == [0.05, 0.05]
 
 
 def test_density_is_over_the_length_of_all_lanes():
-    slot, ticks, looks = stories()[0]
-    carries, _, traffic = play(slot, ticks, looks, TrafficMetrics(CONFIG.dt))
+    slot, ticks, records = stories()[0]
+    carries, _, traffic = play(slot, ticks, records, TrafficMetrics(CONFIG.dt))
     found = Watched().judge(Recorder(), traffic).result(CONFIG, crossing(), carries[-1])
     total = sum(float(x) for x, valid in zip(host().length, host().valid, strict=True) if valid)
     given = traffic.result(carries[-1].traffic, jnp.float32(total))
