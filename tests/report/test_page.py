@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_results import NAN, crashes, made
+from fake_traces import small_trace
 
 from limsim_jax.report import page, tables
 from limsim_jax.report.page import write_report
@@ -193,11 +194,10 @@ def test_key_moments_are_pictured_and_replays_written(tmp_path):
     """The ego's outline and the other one's ring are in both pictures, and links lead to files."""
     pytest.importorskip("matplotlib")
     from matplotlib.image import imread
-    from test_video import made as driven
 
     from limsim_jax.report.video import EGO
 
-    network, lane_map, trace = driven("roundabout")
+    network, lane_map, trace = small_trace("roundabout")
     moments = [
         dict(scenario=GROUP[0], policy=GROUP[1], seed=1, rank=1, kind="contact", time=0.9, other=3, value=4.0)
     ]
@@ -238,9 +238,8 @@ def test_key_moments_are_pictured_and_replays_written(tmp_path):
 
 def test_the_view_holds_both_and_times_outside_the_trace_are_its_ends():
     pytest.importorskip("matplotlib")
-    from test_video import made as driven
 
-    network, lane_map, trace = driven("roundabout")
+    network, lane_map, trace = small_trace("roundabout")
     views = page.pictures(network, lane_map, trace, ego=1, time=1e3, other=99)
     assert [caption for caption, _ in views] == ["1.1 s before", "at 1.2 s"]
     with pytest.raises(ValueError, match="slot 9"):

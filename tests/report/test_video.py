@@ -7,52 +7,21 @@ import numpy as np
 import pytest
 
 pytest.importorskip("matplotlib")
+from fake_traces import HIT, OWN, N, T, small_trace
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from PIL import Image
-from traffic_worlds import bundled
 
 from limsim_jax.maps.lane_map import absolute, lane_rows
 from limsim_jax.maps.signals import SignalState
 from limsim_jax.report import video
 from limsim_jax.report.video import COLLIDED, EGO, SIGNALS, draw_frame, write_picture, write_video
-from limsim_jax.rollout import Trace
-from limsim_jax.types import Status
-
-T, N = 12, 5
-HIT, OWN, LATE, GONE = 1, 2, 3, 4  # slots: collided, an ego, another vehicle from step 6 on, never there
-
-
-def made(name: str) -> Any:
-    """A map, and a trace made by hand: every slot with its own speed, size, heading and place."""
-    network, lane_map = bundled(name)
-    step, slot = np.arange(T)[:, None], np.arange(N)[None]
-    v = (1.0 + 2.0 * slot + 0 * step).astype(np.float32)
-    heading = 0.4 * slot + 0 * step
-    x, y = 10.0 * slot + 0.1 * step * v * np.cos(heading), 5.0 * slot + 0.1 * step * v * np.sin(heading)
-    box = np.stack([x, y, heading, 4.0 + slot + 0 * step, 1.5 + 0.2 * slot + 0 * step], -1)
-    zero, whole = np.zeros((T, N), np.float32), np.zeros((T, N), np.int32)
-    fields: dict[str, Any] = dict(
-        time=np.float32(0.1) * np.arange(1, T + 1, dtype=np.float32),
-        active=(slot != GONE) & (step >= 0),
-        vehicle=np.where((slot == LATE) & (step < 6), 7, slot + 0 * step).astype(np.int32),
-        lane=whole,
-        s=zero,
-        d=zero,
-        v=v,
-        a=zero,
-        box=box.astype(np.float32),
-        status=np.where(slot == HIT, int(Status.COLLIDED), 0) + whole,
-        phase=np.zeros((T, lane_map.signals.duration.shape[0]), np.int32),
-    )
-    trace = Trace(**fields)
-    return network, lane_map, trace
 
 
 @pytest.fixture(scope="module")
 def world() -> Any:
-    return made("roundabout")
+    return small_trace("roundabout")
 
 
 def frames_of(image: Any) -> int:
@@ -100,7 +69,7 @@ def test_tails_end_where_another_vehicle_had_the_slot(world):
 
 
 def test_stop_lines_show_what_the_programs_say():
-    network, lane_map, trace = made("intersection")
+    network, lane_map, trace = small_trace("intersection")
     durations = np.asarray(lane_map.signals.duration)
     phases = int((durations[0] > 0).sum())
     programs = durations.shape[0] - 1
@@ -131,7 +100,7 @@ def test_stop_lines_show_what_the_programs_say():
 
 def test_bars_of_one_lane_lie_as_its_turns_do():
     """Left, straight, right from left to right; none overlaps another."""
-    network, lane_map, _ = made("intersection")
+    network, lane_map, _ = small_trace("intersection")
     rows = lane_rows(network)
     bars, behind = video._stop_bars(network, lane_map)
     rank = {"left": 0, "slight_left": 1, "straight": 2, "slight_right": 3, "right": 4}
