@@ -23,9 +23,9 @@ from scipy.stats import wasserstein_distance
 from limsim_jax.bench import _processor
 from limsim_jax.files import write_whole
 from limsim_jax.metrics.intervals import bootstrap
-from limsim_jax.rollout import enable_compilation_cache, use_all_cores
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.sweep.experiment import Experiment, read_experiments
+from limsim_jax.xla import enable_compilation_cache, use_all_cores
 
 RESULTS = Path(__file__).parent / "results"
 SLOTS = 40

@@ -36,7 +36,7 @@ from limsim_jax.calibration.report import PUBLISHED, calibrate, gather
 from limsim_jax.calibration.synthetic import drivers, follow
 from limsim_jax.calibration.uncertainty import uncertainty
 from limsim_jax.files import write_whole
-from limsim_jax.rollout import enable_compilation_cache
+from limsim_jax.xla import enable_compilation_cache
 
 RESULTS = Path(__file__).parent / "results"
 SOURCES = {

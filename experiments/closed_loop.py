@@ -30,11 +30,12 @@ from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, bundled_maps, load_map
 from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.routing import default_goals
-from limsim_jax.rollout import Rollout, enable_compilation_cache
+from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.traffic.demand import Flow, build_demand
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.vehicles import default_population
 from limsim_jax.types import Config
+from limsim_jax.xla import enable_compilation_cache
 
 RESULTS = Path(__file__).parent / "results"
 SOURCES: dict[str, dict[str, Any]] = {

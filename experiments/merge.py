@@ -25,11 +25,13 @@ from soundness import STANDS, Changes
 from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, load_map
 from limsim_jax.maps.routing import default_goals
-from limsim_jax.rollout import Rollout, Worlds, use_all_cores
+from limsim_jax.simulation.rollout import Rollout
+from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.vehicles import default_population, fitting
 from limsim_jax.types import Config
+from limsim_jax.xla import use_all_cores
 
 RESULTS = Path(__file__).parent / "results"
 MOTORWAY = (1200.0, 2400.0, 3600.0, 4800.0)  # veh/h on its three lanes

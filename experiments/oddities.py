@@ -24,11 +24,12 @@ from limsim_jax.bench import build_traffic
 from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, bundled_maps, load_map
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
-from limsim_jax.rollout import Rollout, enable_compilation_cache, one_world
+from limsim_jax.simulation.rollout import Rollout, one_world
 from limsim_jax.traffic.demand import sample_scenario
 from limsim_jax.traffic.engine import Tick, Traffic
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config
+from limsim_jax.xla import enable_compilation_cache
 
 DT = 0.1
 KINDS = {

@@ -24,11 +24,11 @@ from readme_tables import PAPER, policies
 from limsim_jax.bench import bench_policy
 from limsim_jax.files import write_whole
 from limsim_jax.metrics.intervals import bootstrap, wilson
-from limsim_jax.rollout import enable_compilation_cache, use_all_cores
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.sweep.experiment import read_experiments
 from limsim_jax.sweep.runner import Progress, sweep
 from limsim_jax.sweep.store import open_results
+from limsim_jax.xla import enable_compilation_cache, use_all_cores
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"

@@ -26,11 +26,13 @@ from limsim_jax.maps import build_lane_map, bundled_maps, load_map
 from limsim_jax.maps.conflicts import ConflictTable, ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.maps.signals import SignalState, lane_states
-from limsim_jax.rollout import Rollout, Worlds, use_all_cores
+from limsim_jax.simulation.rollout import Rollout
+from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.traffic.demand import sample_scenario
 from limsim_jax.traffic.engine import Tick, Traffic
 from limsim_jax.traffic.motion import tails
 from limsim_jax.types import Config, State, Status
+from limsim_jax.xla import use_all_cores
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -35,7 +35,7 @@ from limsim_jax.maps import build_lane_map, load_map
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.sumo_demand import read_demand
-from limsim_jax.rollout import Rollout, enable_compilation_cache, use_all_cores
+from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.traffic.car_following import ACC, IDM
 from limsim_jax.traffic.demand import start_state
 from limsim_jax.traffic.ego import Control, Limits, from_lane
@@ -43,6 +43,7 @@ from limsim_jax.traffic.engine import Command, Tick, Traffic, drive
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.sumo_flows import SumoScenario, sumo_scenario
 from limsim_jax.types import Config, Driver, Scenario, Schedule, Shape, State
+from limsim_jax.xla import enable_compilation_cache, use_all_cores
 
 REPO = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("LIMSIM_SHARED_DATA", REPO.parent / "shared" / "data")) / "sumo"
@@ -499,7 +500,7 @@ def run_ours(
     decisions = steps // run.config.decision_every
 
     def chunk(lane_map: LaneMap, schedule: Schedule, carry: Any) -> Any:
-        go = lambda schedule, carry: run.go_on(lane_map, schedule, jax.random.key(0), carry, decisions)  # noqa: E731
+        go = lambda schedule, carry: run.advance(lane_map, schedule, jax.random.key(0), carry, decisions)  # noqa: E731
         result, carry = jax.vmap(go)(schedule, carry)
         return result.trace, carry
 
@@ -511,7 +512,7 @@ def run_ours(
             chunk, mesh=mesh, in_specs=(PartitionSpec(), worlds, worlds), out_specs=worlds, check_vma=False
         )
     )
-    carry = jax.vmap(lambda state: run.begin(lane_map, state))(start)
+    carry = jax.vmap(lambda state: run.init(lane_map, state))(start)
     clock = time.perf_counter()
     program = program.lower(lane_map, schedule, carry).compile()
     compiled = time.perf_counter()

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from limsim_jax.maps.network import Lane as Lane
     from limsim_jax.maps.network import MapError as MapError
     from limsim_jax.maps.network import Network as Network
-    from limsim_jax.rollout import Rollout as Rollout
-    from limsim_jax.rollout import Worlds as Worlds
+    from limsim_jax.simulation.rollout import Rollout as Rollout
+    from limsim_jax.simulation.worlds import Worlds as Worlds
     from limsim_jax.traffic.demand import Flow as Flow
     from limsim_jax.traffic.demand import build_demand as build_demand
     from limsim_jax.traffic.demand import entries as entries
@@ -38,9 +38,9 @@ _HOMES = {
     "LaneMap": "limsim_jax.maps.lane_map",
     "MapError": "limsim_jax.maps.network",
     "Network": "limsim_jax.maps.network",
-    "Rollout": "limsim_jax.rollout",
+    "Rollout": "limsim_jax.simulation.rollout",
     "Traffic": "limsim_jax.traffic.engine",
-    "Worlds": "limsim_jax.rollout",
+    "Worlds": "limsim_jax.simulation.worlds",
     "build_demand": "limsim_jax.traffic.demand",
     "build_lane_map": "limsim_jax.maps",
     "bundled_map": "limsim_jax.maps",

@@ -426,10 +426,12 @@ def _traffic(path: str, told: str) -> dict[str, Any]:
     import numpy as np
 
     from limsim_jax.maps import build_lane_map, load_map
-    from limsim_jax.rollout import Rollout, Worlds, use_all_cores
+    from limsim_jax.simulation.rollout import Rollout
+    from limsim_jax.simulation.worlds import Worlds
     from limsim_jax.traffic.demand import sample_scenario
     from limsim_jax.traffic.engine import Traffic
     from limsim_jax.types import Config
+    from limsim_jax.xla import use_all_cores
 
     options = json.loads(told)
     worlds, slots, seconds, repeats = (options[x] for x in ("worlds", "vehicles", "seconds", "repeats"))
@@ -494,9 +496,11 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
     import numpy as np
     from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-    from limsim_jax.rollout import enable_compilation_cache, over_worlds, run_once, started, use_all_cores
+    from limsim_jax.simulation.rollout import started
+    from limsim_jax.simulation.worlds import over_worlds
     from limsim_jax.sweep.episode import Episodes
     from limsim_jax.sweep.experiment import read_experiments
+    from limsim_jax.xla import enable_compilation_cache, run_once, use_all_cores
 
     options = json.loads(told)
     use_all_cores()

@@ -7,48 +7,11 @@ Each function masks the input as well as the output: a gradient through the unta
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeVar
 
-import jax
 import jax.numpy as jnp
-from jax import lax
-from jax.experimental.xla_metadata import set_xla_metadata
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 Axis = int | Sequence[int] | None
-Tree = TypeVar("Tree")
-
-_kept_apart = jax.jit(lax.optimization_barrier)
-
-
-def computed_once(tree: Tree) -> Tree:
-    """The same arrays; XLA computes them once instead of anew for every use.
-
-    On CPUs it else fuses cheap-looking operations into each of their consumers, whole chains of gathers
-    among them, and drops optimisation barriers before it does so. A call that it may not inline stays.
-    """
-    with set_xla_metadata(inlineable="false"):
-        return _kept_apart(tree)
-
-
-def interval(place: Float[Array, "*b"], count: int) -> tuple[Int[Array, "*b"], Float[Array, "*b"]]:
-    """In which of `count` intervals of length 1 a place is, and where there; outside of all, of the nearest.
-
-    The number is worked out once: XLA may round the place otherwise where it works it out again, and a
-    number and a fraction that do not belong together are off by a whole interval.
-    """
-    k = computed_once(jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 1))
-    return k, place - k.astype(place.dtype)
-
-
-def mapped_like(x: Array, tree: Tree) -> Tree:
-    """The same arrays, over which `vmap` maps if it maps over `x`: for what a scan starts from.
-
-    Constants there that the body replaces by mapped values make `vmap` trace the body once more, and four
-    times that of a scan within a scan.
-    """
-    first = jnp.ravel(x)[0]
-    return jax.tree.map(lambda y: jnp.where(first == first, y, y), tree)
 
 
 def safe_divide(

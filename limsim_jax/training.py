@@ -30,11 +30,12 @@ from limsim_jax.policies.pdm_learned import (
     remember,
     save_weights,
 )
-from limsim_jax.rollout import enable_compilation_cache, started
+from limsim_jax.simulation.rollout import started
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.sweep.experiment import read_experiments
 from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, State
+from limsim_jax.xla import enable_compilation_cache
 
 SCENARIOS = ("highway", "ramp", "intersection", "roundabout", "long_route")
 """Bundled experiments that are trained on."""
@@ -160,7 +161,7 @@ def record(
         run = replace(run, policy=_Recorder(run.policy, run.decisions), measure=None)
 
         def one(lane_map: LaneMap, seed: jax.Array, run: Any = run, episodes: Any = episodes) -> _Memory:
-            return run.go_on(lane_map, *started(run, lane_map, episodes.sample, seed))[1].memory
+            return run.advance(lane_map, *started(run, lane_map, episodes.sample, seed))[1].memory
 
         many = jax.jit(jax.vmap(one, in_axes=(None, 0)))
         for first in range(0, len(seeds), chunk):

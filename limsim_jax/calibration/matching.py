@@ -29,7 +29,7 @@ from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.metrics.reductions import Measured, on_host
 from limsim_jax.metrics.traffic import Detectors, TrafficCarry, TrafficMetrics, TrafficStep
 from limsim_jax.numerics import safe_divide
-from limsim_jax.rollout import Rollout, one_world
+from limsim_jax.simulation.rollout import Rollout, one_world
 from limsim_jax.traffic.demand import Demand, sample_scenario
 from limsim_jax.traffic.engine import Tick
 from limsim_jax.traffic.population_file import FORMAT, read_population

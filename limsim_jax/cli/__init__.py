@@ -23,7 +23,7 @@ from limsim_jax.files import check_writable
 
 if TYPE_CHECKING:
     from limsim_jax.maps.network import ImportReport, Network
-    from limsim_jax.rollout import Totals
+    from limsim_jax.simulation.totals import Totals
 
 # XLA logs an error for every program that it loads from its own cache on a CPU; nothing is wrong.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -240,10 +240,12 @@ def run(
     from limsim_jax.bench import RATE, build_traffic
     from limsim_jax.maps import build_lane_map
     from limsim_jax.maps.network import MapError
-    from limsim_jax.rollout import Result, Rollout, enable_compilation_cache, one_world, trace
+    from limsim_jax.simulation.rollout import Result, Rollout, one_world
+    from limsim_jax.simulation.trace import trace
     from limsim_jax.traffic.demand import sample_scenario
     from limsim_jax.traffic.engine import Traffic
     from limsim_jax.types import Config
+    from limsim_jax.xla import enable_compilation_cache
 
     lane_map = build_lane_map(network)
     per_origin = RATE if rate is None else rate

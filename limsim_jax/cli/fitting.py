@@ -62,7 +62,7 @@ def calibrate(
     from limsim_jax.calibration.report import calibrate as fit
     from limsim_jax.calibration.report import gather
     from limsim_jax.files import write_whole
-    from limsim_jax.rollout import enable_compilation_cache
+    from limsim_jax.xla import enable_compilation_cache
 
     check_writable(out, json_file)
     if not 10 <= period < float("inf"):
@@ -105,8 +105,8 @@ def train(
 ) -> None:
     """Train a policy's network on rollouts of the bundled scenarios."""
     del what  # there is one
-    from limsim_jax.rollout import enable_compilation_cache, use_all_cores
     from limsim_jax.training import train as fit
+    from limsim_jax.xla import enable_compilation_cache, use_all_cores
 
     check_writable(out)
     if seeds < 1:

@@ -267,8 +267,8 @@ def build(
     experiments: Sequence[Experiment], chunk: int | None = None, cores: int | None = None
 ) -> list[Episodes]:
     """Episodes of experiments, on all cores or so many."""
-    from limsim_jax.rollout import use_all_cores
     from limsim_jax.sweep.episode import Episodes
+    from limsim_jax.xla import use_all_cores
 
     with contextlib.suppress(RuntimeError):  # the backend runs already
         use_all_cores(cores)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from limsim_jax.maps.lane_map import LaneMap
     from limsim_jax.maps.network import Network
-    from limsim_jax.rollout import Trace
+    from limsim_jax.simulation.trace import Trace
 
 
 def write_trace(path: Path, network: Network, lane_map: LaneMap, trace: Trace) -> None:

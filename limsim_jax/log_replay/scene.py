@@ -22,8 +22,8 @@ from scipy.spatial import KDTree
 from limsim_jax.log_replay.recorded import Recorded
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, lane_ids, project, relative
 from limsim_jax.maps.network import Network
-from limsim_jax.numerics import interval
 from limsim_jax.types import Driver
+from limsim_jax.xla import interval
 
 GRID = 1.0
 """m between the points of a path."""

@@ -27,8 +27,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from limsim_jax.log_replay.scene import MARGIN, Scene, Sight, pose, separation, sight, sight_of
-from limsim_jax.numerics import mapped_like
 from limsim_jax.traffic.car_following import ACC, IDM, NO_GAP, CarFollowing, ballistic
+from limsim_jax.xla import mapped_like
 
 _GRID = 0.3  # s between moments at which ways are compared
 _STEADY = 1.0  # s for which a vehicle is predicted to go on braking or accelerating

@@ -15,7 +15,6 @@ import contextlib
 import dataclasses
 import enum
 import functools
-import gc
 import hashlib
 import io
 import logging
@@ -26,13 +25,13 @@ import struct
 import tempfile
 import time
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from limsim_jax import __version__
+from limsim_jax.files import cache_directory, no_garbage_collection
 
 logger = logging.getLogger(__name__)
 
@@ -47,14 +46,6 @@ _MAGIC = b"limsimjx"
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def directory() -> Path:
-    """The directory of the cache; it need not exist yet."""
-    if own := os.environ.get("LIMSIM_JAX_CACHE"):
-        return Path(own)
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "limsim_jax"
-
-
 def key(kind: str, *parts: str) -> str:
     """File name of the entry of this kind for these parts (hashes, names, options)."""
     digest = hashlib.sha256(_fingerprint())
@@ -66,7 +57,7 @@ def key(kind: str, *parts: str) -> str:
 def load(name: str) -> Any | None:
     """The entry, or None if there is none that can be used. A damaged one is logged and removed."""
     try:
-        path = directory() / name
+        path = cache_directory() / name
         data = path.read_bytes()
     except (OSError, RuntimeError):  # Path.home() raises RuntimeError where there is no home
         return None
@@ -85,7 +76,7 @@ def load(name: str) -> Any | None:
 def store(name: str, value: Any) -> None:
     """Write an entry, all of it or nothing. Where that is not possible, say so once and go on."""
     try:
-        folder = directory()
+        folder = cache_directory()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=folder, prefix=name, suffix=".tmp")
         try:
@@ -115,19 +106,8 @@ def _decode(data: bytes) -> Any:
     payload = memoryview(data)[_HEADER.size :]
     if magic != _MAGIC or length != len(payload) or checksum != zlib.crc32(payload):
         raise ValueError("truncated or changed")
-    with _collector_off():  # it would walk the growing heap again and again: half of the time
+    with no_garbage_collection():  # it would walk the growing heap again and again: half of the time
         return _Unpickler(io.BytesIO(payload)).load()
-
-
-@contextlib.contextmanager
-def _collector_off() -> Iterator[None]:
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
 
 
 class _Pickler(pickle.Pickler):

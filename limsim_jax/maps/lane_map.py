@@ -38,7 +38,8 @@ from limsim_jax.maps.conflicts import ConflictTable, build_conflicts
 from limsim_jax.maps.network import ImportReport, Lane, LaneType, MapError, Network
 from limsim_jax.maps.routing import RouteTable, build_routes, default_goals
 from limsim_jax.maps.signals import SignalTable, build_signals
-from limsim_jax.numerics import computed_once, safe_divide, safe_sqrt
+from limsim_jax.numerics import safe_divide, safe_sqrt
+from limsim_jax.xla import computed_once
 
 Floats = NDArray[np.float64]
 

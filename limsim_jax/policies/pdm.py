@@ -52,7 +52,7 @@ from numpy.typing import NDArray
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
 from limsim_jax.maps.signals import SignalState, lane_states
-from limsim_jax.numerics import computed_once, mapped_like, safe_norm
+from limsim_jax.numerics import safe_norm
 from limsim_jax.policies.base import Policy
 from limsim_jax.policies.predict import Predictor, nearest, straight
 from limsim_jax.policies.reference import Place, Way, place_on, way_ahead
@@ -61,6 +61,7 @@ from limsim_jax.traffic.collision import OVERHANG
 from limsim_jax.traffic.ego import Limits, Trajectory
 from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, State
+from limsim_jax.xla import computed_once, mapped_like
 
 DT = 0.1
 """s between the poses of a proposal."""

@@ -18,11 +18,12 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s
-from limsim_jax.numerics import computed_once, safe_divide
+from limsim_jax.numerics import safe_divide
 from limsim_jax.traffic.collision import CLEARANCE, level
 from limsim_jax.traffic.ego import Trajectory, is_free
 from limsim_jax.traffic.motion import CREEP_SPEED, boxes, smooth_step
 from limsim_jax.types import State
+from limsim_jax.xla import computed_once
 
 SETTLE = 3.0
 """s in which the offset of a vehicle that changes no lanes fades to the middle of its lane."""

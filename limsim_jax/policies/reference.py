@@ -14,10 +14,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, neighbor, pose, side_s, width
-from limsim_jax.numerics import interval
 from limsim_jax.traffic.ego import body_place
 from limsim_jax.traffic.motion import lateral_speed
 from limsim_jax.types import State
+from limsim_jax.xla import interval
 
 
 @struct.dataclass(frozen=True, kw_only=True)

@@ -45,7 +45,7 @@ from limsim_jax.report.tables import (
 if TYPE_CHECKING:
     from limsim_jax.maps.lane_map import LaneMap
     from limsim_jax.maps.network import Network
-    from limsim_jax.rollout import Trace
+    from limsim_jax.simulation.trace import Trace
     from limsim_jax.sweep.store import Results
 
 Replayer = Callable[[str, str, int], tuple[Any, ...]]

@@ -20,7 +20,7 @@ from limsim_jax.maps.draw import INK, TRAFFIC_ZORDER, Bounds, _prepare, _strips,
 from limsim_jax.maps.lane_map import LaneMap, absolute, lane_rows
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.signals import SignalState, lane_states
-from limsim_jax.rollout import Trace
+from limsim_jax.simulation.trace import Trace
 from limsim_jax.types import Status
 
 if TYPE_CHECKING:

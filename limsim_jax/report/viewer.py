@@ -32,7 +32,7 @@ from limsim_jax.maps.network import Control, Network
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.metrics.safety import NO_GAP, NONE, encounter, ttc_1d, ttc_2d
 from limsim_jax.report.video import COLLIDED, EGO, SIGNALS, _stop_bars
-from limsim_jax.rollout import Trace
+from limsim_jax.simulation.trace import Trace
 from limsim_jax.types import Status
 
 LOOK_AHEAD = 150.0

@@ -33,19 +33,10 @@ from limsim_jax.metrics.traffic import NAMES as TRAFFIC_NAMES
 from limsim_jax.policies import POLICIES
 from limsim_jax.policies.base import Policy, made, variants
 from limsim_jax.policies.predict import Recalled, straight
-from limsim_jax.rollout import (
-    Carry,
-    Result,
-    Rollout,
-    Started,
-    Totals,
-    Trace,
-    Worlds,
-    enable_compilation_cache,
-    run_once,
-    started,
-    trace,
-)
+from limsim_jax.simulation.rollout import Carry, Result, Rollout, Started, started
+from limsim_jax.simulation.totals import Totals
+from limsim_jax.simulation.trace import Trace, trace
+from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweep.experiment import Bounds, EgoTable, Experiment, ExperimentError
 from limsim_jax.sweep.store import Outcome
 from limsim_jax.traffic import car_following
@@ -60,6 +51,7 @@ from limsim_jax.traffic.vehicles import (
     uniform_population,
 )
 from limsim_jax.types import Config, Scenario, State
+from limsim_jax.xla import enable_compilation_cache, run_once
 
 HARD = 3.4
 """m/s^2 of braking asked for by the leader (DRAC) from which it is a key moment."""
@@ -268,9 +260,9 @@ class Episodes:
 
     def _again(self, seed: int, slot: int = -1, at: float = np.inf) -> Result:
         """One world, every step; the vehicle in `slot` brakes from `at` s on."""
-        start, go_on = self._one
+        start, advance = self._one
         world = start(self.lane_map, np.int32(seed))
-        result = jax.device_get(go_on(self.lane_map, world, np.int32(slot), np.float32(at)))
+        result = jax.device_get(advance(self.lane_map, world, np.int32(slot), np.float32(at)))
         single = jax.tree.map(lambda x: x[None], (result.measures, result.totals))
         return result._replace(measures=single[0], totals=single[1])
 
@@ -281,12 +273,12 @@ class Episodes:
         For `first` decisions the policy is the own one, for `more` the other one.
         """
 
-        def go_on(
+        def advance(
             module: str, lane_map: LaneMap, world: Started, first: jax.Array, more: jax.Array, box: jax.Array
         ) -> Any:
             def decisions(run: Rollout, count: jax.Array, carry: Carry) -> Carry:
                 def one(_: Any, carry: Carry) -> Carry:
-                    return run.go_on(lane_map, world.schedule, world.key, carry, 1)[1]
+                    return run.advance(lane_map, world.schedule, world.key, carry, 1)[1]
 
                 return jax.lax.fori_loop(0, count, one, carry)
 
@@ -297,7 +289,7 @@ class Episodes:
             carry = decisions(replace(run, policy=other), more, carry)
             return EvaluateEgo().result(run.config, lane_map, carry.measured)
 
-        return {module: jax.jit(partial(go_on, module)) for module in variants(self._policy, straight)}
+        return {module: jax.jit(partial(advance, module)) for module in variants(self._policy, straight)}
 
     def _modules_to_blame(self, seed: int, kind: str, start: float, end: float, seen: Trace) -> list[str]:
         """Modules of the policy whose references, in their places from `start` s on, avoid it until `end`."""
@@ -306,8 +298,8 @@ class Episodes:
         more = min(math.ceil(end / every), self.rollout.decisions) - first
         world = self._one[0](self.lane_map, np.int32(seed))
         found = []
-        for module, go_on in self._references.items():
-            measures = go_on(self.lane_map, world, np.int32(first), np.int32(more), seen.box)
+        for module, advance in self._references.items():
+            measures = advance(self.lane_map, world, np.int32(first), np.int32(more), seen.box)
             if on_host(measures)[f"{kind}_time"] is None:
                 found.append(module)
         return found
@@ -317,12 +309,12 @@ class Episodes:
         def start(lane_map: LaneMap, seed: jax.Array) -> Started:
             return started(self.rollout, lane_map, self.sample, seed)
 
-        def go_on(lane_map: LaneMap, world: Started, slot: jax.Array, at: jax.Array) -> Result:
+        def advance(lane_map: LaneMap, world: Started, slot: jax.Array, at: jax.Array) -> Result:
             run = replace(self.rollout, record=trace, policy=_Braking(self._policy, slot, at))
-            return run.go_on(lane_map, *world)[0]
+            return run.advance(lane_map, *world)[0]
 
         enable_compilation_cache()
-        return jax.jit(start, compiler_options=run_once()), jax.jit(go_on)
+        return jax.jit(start, compiler_options=run_once()), jax.jit(advance)
 
 
 class _Braking:

@@ -1,9 +1,9 @@
-"""What if: a world of a sweep, stopped at some moments, from which `Rollout.go_on` branches.
+"""What if: a world of a sweep, stopped at some moments, from which `Rollout.advance` branches.
 
 now = stopped(episodes, seed=7, times=[11.0, 12.0])
 futures = fork(now.carry, 5)  # [5, 2, ...]: five copies of both moments, to be changed at will
-go_on = lambda carry: now.run.go_on(now.lane_map, now.schedule, now.key, carry, decisions=20)[0]
-found = jax.jit(jax.vmap(jax.vmap(go_on)))(futures).measures  # metrics [5, 2] of the next 20 decisions
+advance = lambda carry: now.run.advance(now.lane_map, now.schedule, now.key, carry, decisions=20)[0]
+found = jax.jit(jax.vmap(jax.vmap(advance)))(futures).measures  # metrics [5, 2] of the next 20 decisions
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.rollout import Carry, Rollout, Started, enable_compilation_cache, run_once, started
+from limsim_jax.simulation.rollout import Carry, Rollout, Started, started
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.types import Schedule
+from limsim_jax.xla import enable_compilation_cache, run_once
 
 
 class Stopped(NamedTuple):
@@ -61,7 +62,7 @@ def stopped(episodes: Episodes, seed: int, times: Sequence[float]) -> Stopped:
 
     @jax.jit
     def decide(lane_map: LaneMap, schedule: Schedule, carry: Carry) -> Carry:
-        return bare.go_on(lane_map, schedule, key, carry, 1)[1]
+        return bare.advance(lane_map, schedule, key, carry, 1)[1]
 
     carries = [begun]
     for _ in range(max(wanted)):

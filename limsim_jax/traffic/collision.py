@@ -26,10 +26,10 @@ from limsim_jax.maps.lane_map import (
     to_frenet,
     width,
 )
-from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.ego import at_slots, body_place
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, State, Status
+from limsim_jax.xla import computed_once
 
 REACH = 1.0
 """m, how far `contacts` looks; what is farther away counts as this far."""

@@ -27,9 +27,10 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from limsim_jax.geometry import direction, wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, pose, project, side_s, to_frenet, width
-from limsim_jax.numerics import interval, safe_divide, safe_norm
+from limsim_jax.numerics import safe_divide, safe_norm
 from limsim_jax.traffic.car_following import ballistic
 from limsim_jax.types import Config, Egos, State
+from limsim_jax.xla import interval
 
 _AGAINST = 3.5  # m: a lane is that much less fitting if the ego points against it
 _NOT_AT_ALL = 1e9  # m

@@ -19,7 +19,6 @@ from jaxtyping import Array, Bool, Float, Int
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, bend_speed, curvature, room_beside
 from limsim_jax.maps.routing import NO_ROOM
 from limsim_jax.maps.signals import SignalState, lane_states
-from limsim_jax.numerics import computed_once, mapped_like
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
 from limsim_jax.traffic.collision import AfterCollision, after_collision
 from limsim_jax.traffic.collision import record as record_events
@@ -53,6 +52,7 @@ from limsim_jax.traffic.neighbors import (
 from limsim_jax.traffic.right_of_way import give_way, rows_ahead
 from limsim_jax.traffic.signals import switch
 from limsim_jax.types import Config, Schedule, State, Status
+from limsim_jax.xla import computed_once, mapped_like
 
 PATIENCE = 20.0
 """s of waiting at the end of a wrong lane before a driver gives up the route."""

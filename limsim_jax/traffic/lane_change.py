@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, room_beside, side_s, width
-from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
 from limsim_jax.traffic.motion import CREEP_SPEED
 from limsim_jax.traffic.neighbors import Obstacles, Pair
 from limsim_jax.types import State
+from limsim_jax.xla import computed_once
 
 ROUTE_BASE, ROUTE_URGENT = 0.5, 4.0
 """m/s^2, incentive for a change that the route needs: at no, and at full urgency."""

@@ -6,7 +6,6 @@ gap now is that gap plus what the obstacle has travelled since, less what the ve
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import replace
 from typing import NamedTuple
@@ -17,11 +16,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.geometry import polynomial
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, width
-from limsim_jax.numerics import computed_once, safe_divide
+from limsim_jax.numerics import safe_divide
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing, ballistic
 from limsim_jax.traffic.ego import overlay_boxes
 from limsim_jax.traffic.neighbors import Obstacles
 from limsim_jax.types import Config, State, Status
+from limsim_jax.xla import column_min, computed_once
 
 WALKING_SPEED = 1.5
 """m/s, below which a vehicle counts as waiting."""
@@ -52,15 +52,6 @@ COURTESY = 2.0
 """m/s^2, the hardest braking to let somebody in, or to find a place on the next lane."""
 
 
-def _least(rows: Float[Array, "K N"]) -> Float[Array, " N"]:
-    """The least of each column.
-
-    The gradient of `min` looks for what equals it and divides by how many do: none, where XLA works the rows
-    out twice and rounds them otherwise.
-    """
-    return functools.reduce(lambda x, y: jnp.where(x < y, x, y), rows)
-
-
 @jax.named_scope("accelerations")
 def accelerations(
     model: CarFollowing, state: State, decision: Decision, x: Float[Array, " N"]
@@ -83,7 +74,7 @@ def accelerations(
     reach = jnp.sqrt(decision.v_ahead**2 + 2 * _APPROACH * driver.b * room + 1e-6)
     v0 = jnp.minimum(decision.v0, reach)
     each, v, v_free = jax.tree.map(lambda value: value[None], (driver, state.v, v0))
-    a = _least(model(each, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free))
+    a = column_min(model(each, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free))
     # the models only lag behind a desired speed that falls: who is above it brakes as hard as that takes
     need = (state.v * state.v - decision.v_ahead**2) / (2 * jnp.maximum(room, 0.5))
     a = jnp.where(state.v > reach, jnp.minimum(a, -jnp.clip(need, 0, driver.b)), a)
@@ -96,7 +87,7 @@ def accelerations(
     minds = (index >= 0) & state.active[index]
     gap = jnp.where(minds, gap0 + seen(index, x) - x[None], NO_GAP)
     v_lead = jnp.where(minds, seen(index, state.v), state.v[None])
-    kind = _least(model(each, gap=gap, v=v, v_lead=v_lead, a_lead=jnp.zeros_like(gap), v0=v_free))
+    kind = column_min(model(each, gap=gap, v=v, v_lead=v_lead, a_lead=jnp.zeros_like(gap), v0=v_free))
     return jnp.minimum(a, jnp.maximum(kind, -COURTESY))
 
 

@@ -14,9 +14,9 @@ from jax import lax
 from jaxtyping import Array, Float, Int, UInt
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
-from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.types import Config, State
+from limsim_jax.xla import computed_once
 
 _POSITION_BITS = 18  # of a sort key, at most: positions on a lane to 1 / 2^18 of its length
 _FEWEST_BITS = 14  # with fewer left for the position, the number of the entry stays out of the key

@@ -29,11 +29,11 @@ from jaxtyping import Array, Bool, Float, Int
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, turn_speed
 from limsim_jax.maps.signals import SignalState, lane_states
-from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.motion import tails
 from limsim_jax.traffic.neighbors import Ahead, Pair, Shelf
 from limsim_jax.types import Config, Driver, Lights, State
+from limsim_jax.xla import computed_once
 
 GAP_LEAD = 1.5
 """s between the own exit of a stretch and the entry of a vehicle with priority, for a `gap_factor` of 1."""

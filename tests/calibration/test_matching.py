@@ -10,7 +10,7 @@ from limsim_jax.calibration.matching import Engine, TrafficFlow
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.traffic import TrafficStep
-from limsim_jax.rollout import Rollout
+from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.traffic.demand import build_demand
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.vehicles import default_population

@@ -13,6 +13,7 @@ import pytest
 
 import limsim_jax as lj
 from limsim_jax import maps
+from limsim_jax.files import cache_directory
 from limsim_jax.maps import cache
 from limsim_jax.maps.network import ImportReport, Lane, Network
 
@@ -258,12 +259,12 @@ def test_old_entries_and_remains_are_pruned(folder, monkeypatch):
 def test_place_of_the_cache(monkeypatch, tmp_path):
     monkeypatch.delenv("LIMSIM_JAX_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert cache.directory() == tmp_path / "xdg" / "limsim_jax"
+    assert cache_directory() == tmp_path / "xdg" / "limsim_jax"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # to be ignored, says the XDG specification
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert cache.directory() == tmp_path / "home" / ".cache" / "limsim_jax"
+    assert cache_directory() == tmp_path / "home" / ".cache" / "limsim_jax"
     monkeypatch.delenv("XDG_CACHE_HOME")
-    assert cache.directory() == tmp_path / "home" / ".cache" / "limsim_jax"
+    assert cache_directory() == tmp_path / "home" / ".cache" / "limsim_jax"
 
 
 def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):

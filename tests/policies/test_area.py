@@ -13,7 +13,8 @@ from limsim_jax.maps.routing import default_goals
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.policies.simple import FollowLane
-from limsim_jax.rollout import Rollout, one_world, trace
+from limsim_jax.simulation.rollout import Rollout, one_world
+from limsim_jax.simulation.trace import trace
 from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, entries, sample_scenario
 from limsim_jax.traffic.ego import assign, from_lane, with_rows
 from limsim_jax.traffic.engine import Traffic

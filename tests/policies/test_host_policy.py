@@ -15,7 +15,8 @@ from limsim_jax.maps.lane_map import lane_rows, pose
 from limsim_jax.maps.signals import SignalState
 from limsim_jax.policies import host
 from limsim_jax.policies.host import HostPolicy, Observe
-from limsim_jax.rollout import Rollout, Worlds
+from limsim_jax.simulation.rollout import Rollout
+from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.sweep.experiment import Experiment
 from limsim_jax.traffic.ego import Meta, from_lane
@@ -89,7 +90,7 @@ def rollout(policy, horizon=10.0):
 
 def run_one(run, state):
     lane_map = bundled("highway")[1]
-    return run.go_on(lane_map, no_arrivals(state), jax.random.key(0), run.begin(lane_map, state))
+    return run.advance(lane_map, no_arrivals(state), jax.random.key(0), run.init(lane_map, state))
 
 
 def stack(states):

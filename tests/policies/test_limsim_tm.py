@@ -19,7 +19,8 @@ from limsim_jax.policies.limsim_tm.search import Settings
 from limsim_jax.policies.pdm import PDMClosed
 from limsim_jax.policies.predict import constant_velocity, straight
 from limsim_jax.policies.simple import FollowLane
-from limsim_jax.rollout import Rollout, one_world, trace
+from limsim_jax.simulation.rollout import Rollout, one_world
+from limsim_jax.simulation.trace import trace
 from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, entries, sample_scenario
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.engine import Traffic

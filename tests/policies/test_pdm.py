@@ -18,7 +18,8 @@ from limsim_jax.metrics.motion import motion_init, motion_result, motion_update
 from limsim_jax.policies import pdm
 from limsim_jax.policies.pdm import PDMClosed
 from limsim_jax.policies.reference import Way
-from limsim_jax.rollout import Rollout, trace
+from limsim_jax.simulation.rollout import Rollout
+from limsim_jax.simulation.trace import trace
 from limsim_jax.traffic.ego import Limits, from_lane, step_free, track, with_rows
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes
@@ -593,7 +594,7 @@ def test_it_follows_a_leader_to_a_red_light_and_waits():
 
     @jax.jit
     def go(state):
-        return run.go_on(lane_map, no_arrivals(state), jax.random.key(0), run.begin(lane_map, state))[0]
+        return run.advance(lane_map, no_arrivals(state), jax.random.key(0), run.init(lane_map, state))[0]
 
     # the lights are those of the clock: begin when the one ahead has just turned red
     duration = np.asarray(lane_map.signals.duration)

@@ -33,7 +33,7 @@ from traffic_worlds import bundled
 
 from limsim_jax.maps.lane_map import lane_ids, pose
 from limsim_jax.report.viewer import write_viewer
-from limsim_jax.rollout import Trace
+from limsim_jax.simulation.trace import Trace
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ from limsim_jax.maps.lane_map import VEHICLE_CLASSES, absolute, lane_ids
 from limsim_jax.maps.signals import SignalState
 from limsim_jax.report.video import EGO, SIGNALS
 from limsim_jax.report.viewer import DRIVEN, write_viewer
-from limsim_jax.rollout import Trace
+from limsim_jax.simulation.trace import Trace
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,11 @@ from limsim_jax.maps.routing import default_goals
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.policies.simple import FollowLane
-from limsim_jax.rollout import Rollout, Worlds, count, fork, load, save, trace, world_key
+from limsim_jax.simulation.checkpoint import fork, load, save
+from limsim_jax.simulation.rollout import Rollout, world_key
+from limsim_jax.simulation.totals import count
+from limsim_jax.simulation.trace import trace
+from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, entries, sample_scenario
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.vehicles import default_population, fitting, sample_vehicles, uniform_population
@@ -48,7 +52,7 @@ def part():
     """A quarter of the run of one world."""
     lane_map = bundled("roundabout")[1]
     run = dataclasses.replace(RUN, record=trace)
-    return jax.jit(lambda schedule, key, carry: run.go_on(lane_map, schedule, key, carry, 15))
+    return jax.jit(lambda schedule, key, carry: run.advance(lane_map, schedule, key, carry, 15))
 
 
 def test_totals_add_up_and_nothing_goes_wrong():
@@ -81,7 +85,7 @@ def test_who_gets_on_by_less_than_five_metres_in_two_minutes_is_stuck(speed, gri
     """200 s: half of the vehicles drive on, half leave after 100 s, and one does what it is told."""
     config = RUN.config
     before = jax.jit(sampler())(jax.random.key(0)).start
-    carry = RUN.begin(bundled("roundabout")[1], before)
+    carry = RUN.init(bundled("roundabout")[1], before)
     totals, stood, me = carry.totals, carry.stood, int(np.flatnonzero(before.active)[0])
     counted = jax.jit(functools.partial(count, config))
     leave = np.arange(SLOTS) % 2 == (me + 1) % 2
@@ -111,7 +115,7 @@ def test_a_world_is_the_same_in_any_company():
 def test_saved_and_resumed_ends_as_run_through(tmp_path):
     scenario = jax.jit(sampler())(world_key(1))
     key = jax.random.key(5)
-    start = RUN.begin(bundled("roundabout")[1], scenario.start)
+    start = RUN.init(bundled("roundabout")[1], scenario.start)
     _, carry = part()(scenario.schedule, key, start)
     save(tmp_path / "world.npz", carry)
     through, _ = part()(scenario.schedule, key, carry)
@@ -217,7 +221,7 @@ def test_tables_of_a_trace_tell_it_too(tmp_path):
 
 def test_a_trace_of_traffic_alone_knows_of_no_egos():
     scenario = jax.jit(sampler())(world_key(1))
-    start = RUN.begin(bundled("roundabout")[1], scenario.start)
+    start = RUN.init(bundled("roundabout")[1], scenario.start)
     seen = part()(scenario.schedule, jax.random.key(5), start)[0].trace
     assert seen.driven is seen.to_go is seen.plan is seen.plan_time is None
     assert seen.vehicle_class.shape == (75, SLOTS)

@@ -12,7 +12,7 @@ from traffic_worlds import bundled
 
 from limsim_jax.maps.lane_map import lane_rows, pose
 from limsim_jax.report.viewer import write_viewer
-from limsim_jax.rollout import Trace
+from limsim_jax.simulation.trace import Trace
 from limsim_jax.types import Status
 
 T, DT = 60, 0.1

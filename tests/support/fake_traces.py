@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from traffic_worlds import bundled
 
-from limsim_jax.rollout import Trace
+from limsim_jax.simulation.trace import Trace
 from limsim_jax.types import Status
 
 T, N = 12, 5

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from limsim_jax.policies.simple import ConstantSpeed
-from limsim_jax.rollout import fork, one_world
+from limsim_jax.simulation.checkpoint import fork
+from limsim_jax.simulation.rollout import one_world
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.sweep.experiment import EgoTable, Experiment, TrafficTable
 from limsim_jax.sweep.what_if import stopped
@@ -49,7 +50,7 @@ def test_a_stopped_world_goes_on_as_in_the_sweep(episodes, now):
         return one_world(run, lane_map, episodes.sample, SEED)
 
     def rest(lane_map, schedule, carry):
-        return run.go_on(lane_map, schedule, now.key, carry, left)[0]
+        return run.advance(lane_map, schedule, now.key, carry, left)[0]
 
     wanted = jax.jit(whole)(now.lane_map).state
     futures = fork(jax.tree.map(lambda x: x[1], now.carry), 2)
@@ -80,7 +81,8 @@ def test_places_of_planned_vehicles_stay_as_many():
     run, lane_map, schedule, key, carry = stopped(episodes, SEED, [1.0])
     assert carry.state.egos.slot.shape == (1, 4)
     shapes = jax.eval_shape(
-        lambda lane_map: run.go_on(lane_map, schedule, key, jax.tree.map(lambda x: x[0], carry), 1), lane_map
+        lambda lane_map: run.advance(lane_map, schedule, key, jax.tree.map(lambda x: x[0], carry), 1),
+        lane_map,
     )
     assert shapes[1].state.egos.slot.shape == (4,)
 

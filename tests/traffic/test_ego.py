@@ -11,7 +11,8 @@ from traffic_worlds import bundled, no_arrivals, state_of
 
 from limsim_jax.maps.lane_map import NO_LANE, pose, to_frenet, width
 from limsim_jax.policies.simple import FollowLane
-from limsim_jax.rollout import Rollout, trace
+from limsim_jax.simulation.rollout import Rollout
+from limsim_jax.simulation.trace import trace
 from limsim_jax.traffic import ego
 from limsim_jax.traffic.ego import Control, Limits, Meta, Trajectory
 from limsim_jax.traffic.engine import Traffic

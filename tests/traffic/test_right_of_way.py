@@ -17,7 +17,7 @@ from limsim_jax.maps.lane_map import LaneMap, build_lane_map, lane_rows
 from limsim_jax.maps.network import Control
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.signals import SignalState, phase_at
-from limsim_jax.rollout import Rollout, world_key
+from limsim_jax.simulation.rollout import Rollout, world_key
 from limsim_jax.traffic import right_of_way
 from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario, start_state
 from limsim_jax.traffic.engine import Command, Traffic, decide, drive

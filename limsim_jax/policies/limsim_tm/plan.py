@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.numerics import computed_once, interval, mapped_like
 from limsim_jax.policies.reference import Frenet, Place, Way, place_on
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
 from limsim_jax.types import Driver
+from limsim_jax.xla import computed_once, interval, mapped_like
 
 
 class Task(NamedTuple):

@@ -12,7 +12,6 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, neighbor
-from limsim_jax.numerics import interval
 from limsim_jax.policies.base import Policy
 from limsim_jax.policies.limsim_tm.decide import Told, grouped, neighbours, tell
 from limsim_jax.policies.limsim_tm.plan import Lattice, Merge, Others, Task, plan, room_needed
@@ -27,6 +26,7 @@ from limsim_jax.traffic.engine import Command, Decision, Traffic
 from limsim_jax.traffic.lane_change import urgency
 from limsim_jax.traffic.motion import CREEP_SPEED
 from limsim_jax.types import Config, State
+from limsim_jax.xla import interval
 
 
 class Memory(NamedTuple):

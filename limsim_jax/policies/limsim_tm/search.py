@@ -19,18 +19,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from limsim_jax.numerics import computed_once
 from limsim_jax.traffic.car_following import NO_GAP, ballistic
 from limsim_jax.traffic.ego import Meta
 from limsim_jax.types import Driver
+from limsim_jax.xla import batch_last, computed_once
 
 ACTIONS = 5
 """KEEP, ACCELERATE, DECELERATE, LEFT, RIGHT: those of `traffic.ego.Meta` but STOP."""
@@ -131,12 +130,12 @@ def search(settings: Settings, scene: Scene, previous: Int[Array, "G D"], key: K
       key: orders actions that have not been tried yet. Same key, same plan.
     """
     noise = jax.random.uniform(key, (scene.s.shape[0], ACTIONS), scene.s.dtype)
-    return _batch_last(lambda *of: _search(settings, *of))(_in_floats(scene), previous, noise)
+    return batch_last(lambda *of: _search(settings, *of))(_in_floats(scene), previous, noise)
 
 
 def play(settings: Settings, scene: Scene, actions: Int[Array, "G D"]) -> Plan:
     """The plan in which the vehicles take these actions (-1: the default policy); no `visits`."""
-    return _batch_last(lambda *of: _play(settings, *of))(_in_floats(scene), actions)
+    return batch_last(lambda *of: _play(settings, *of))(_in_floats(scene), actions)
 
 
 def _in_floats(scene: Scene) -> Scene:
@@ -144,21 +143,6 @@ def _in_floats(scene: Scene) -> Scene:
     names = "lane", "aim", "first_lane", "last_lane", "wanted_first", "wanted_last"
     lanes = {name: getattr(scene, name).astype(scene.s.dtype) for name in names}
     return scene._replace(**lanes, lane_width=scene.lane_width[None])
-
-
-def _batch_last(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function`, but `vmap` puts the axis it maps over last in all arrays."""
-    mapped = custom_vmap(function)
-
-    @mapped.def_vmap
-    def _(size: int, batched: Any, *of: Any) -> tuple[Any, Any]:
-        def last(x: Array, has: bool) -> Array:
-            return jnp.moveaxis(x, 0, -1) if has else jnp.broadcast_to(x[..., None], (*x.shape, size))
-
-        result = mapped(*jax.tree.map(last, of, tuple(batched)))
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), result), jax.tree.map(lambda _: True, result)
-
-    return mapped
 
 
 # ---- what happens within a decision

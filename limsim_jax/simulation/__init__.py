@@ -1,0 +1,1 @@
+"""Worlds through time: `rollout` (one), `worlds` (many on all devices), `checkpoint` (fork, save, load)."""

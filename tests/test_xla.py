@@ -1,0 +1,108 @@
+"""Every compiler trick does what it is for, in the compiled program or in the numbers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from limsim_jax.xla import (
+    batch_last,
+    column_min,
+    computed_once,
+    enable_compilation_cache,
+    interval,
+    mapped_like,
+    run_once,
+)
+
+
+def compiled_text(function, *args):
+    return jax.jit(function).lower(*args).compile().as_text()
+
+
+def test_a_value_computed_once_stays_a_call_of_its_own():
+    """XLA inlines calls and removes barriers; what it may not inline keeps its value in one place."""
+    table, index = jnp.arange(64.0), jnp.arange(16) % 7
+
+    def uses(keep):
+        def function(table, index):
+            value = table[index] * 2.0
+            value = computed_once(value) if keep else value
+            return tuple(jnp.sum(jnp.sin(value + k), axis=0) for k in range(4))
+
+        return function
+
+    kept, fused = (compiled_text(uses(keep), table, index) for keep in (True, False))
+    assert kept.count(" call(") == fused.count(" call(") + 1
+    for with_it, without in zip(uses(True)(table, index), uses(False)(table, index), strict=True):
+        np.testing.assert_allclose(with_it, without, rtol=1e-6)
+
+
+def test_a_value_computed_once_has_the_same_gradient():
+    x = jnp.linspace(0.1, 2.0, 7)
+    np.testing.assert_array_equal(
+        jax.grad(lambda x: computed_once(jnp.sin(x)).sum())(x), jax.grad(lambda x: jnp.sin(x).sum())(x)
+    )
+
+
+def test_number_and_fraction_of_an_interval_belong_together():
+    place = jnp.asarray([-0.5, 0.0, 0.999, 1.0, 2.5, 3.0, 7.25], jnp.float32)
+    number, fraction = jax.jit(interval, static_argnums=1)(place, 3)
+    np.testing.assert_array_equal(number, [0, 0, 0, 1, 2, 2, 2])
+    np.testing.assert_array_equal(number.astype(fraction.dtype) + fraction, place)
+
+
+def test_the_least_of_each_column_has_a_finite_gradient_where_rows_are_equal():
+    rows = jnp.asarray([[1.0, 5.0, 2.0], [1.0, 4.0, 3.0]])
+    np.testing.assert_array_equal(column_min(rows), rows.min(0))
+    gradient = jax.grad(lambda rows: column_min(rows).sum())(rows)
+    np.testing.assert_array_equal(gradient.sum(0), [1.0, 1.0, 1.0])
+
+
+def test_the_start_of_a_scan_is_mapped_as_its_input():
+    def run(x, aligned):
+        def body(carry, _):
+            return (carry[0] + x, carry[1] * 2), None
+
+        start = (jnp.zeros(()), jnp.ones(()))
+        return jax.lax.scan(body, mapped_like(x, start) if aligned else start, None, length=3)[0]
+
+    x = jnp.arange(4.0)
+    start = jax.vmap(lambda x: mapped_like(x, jnp.zeros(())))(x)
+    assert start.shape == (4,)
+    found = jax.vmap(lambda x: run(x, True))(x)
+    np.testing.assert_array_equal(found[0], 3 * x)
+    np.testing.assert_array_equal(found[1], np.full(4, 8.0))
+
+
+def test_a_batch_axis_that_is_last_gives_the_same_numbers():
+    x = jnp.arange(12.0).reshape(3, 4)
+    seen = []
+
+    def double(x, y):
+        seen.append(x.shape)
+        return 2 * x + y
+
+    found = jax.vmap(batch_last(double), in_axes=(0, None))(x, jnp.ones(4))
+    np.testing.assert_array_equal(found, 2 * x + 1)
+    assert (4, 3) in seen
+
+
+def test_a_program_that_runs_once_is_compiled_without_optimisation():
+    options = run_once()
+    if jax.default_backend() == "cpu":
+        assert options is not None and options["xla_backend_optimization_level"] == 0
+        assert float(jax.jit(lambda x: x + 1, compiler_options=options)(1.0)) == 2.0
+
+
+def test_a_compilation_cache_that_the_user_chose_stays(tmp_path):
+    before = jax.config.values["jax_compilation_cache_dir"]
+    assert before is not None
+    enable_compilation_cache()
+    assert jax.config.values["jax_compilation_cache_dir"] == before
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_an_interval_is_within_its_count(count):
+    number, _ = interval(jnp.asarray([-1e6, 1e6], jnp.float32), count)
+    np.testing.assert_array_equal(number, [0, count - 1])
