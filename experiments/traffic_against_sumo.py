@@ -37,11 +37,11 @@ from limsim_jax.maps.network import Network
 from limsim_jax.maps.sumo_demand import read_demand
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.traffic.car_following import ACC, IDM
-from limsim_jax.traffic.demand import start_state
+from limsim_jax.traffic.demand.sumo import SumoScenario, sumo_scenario
 from limsim_jax.traffic.ego import Control, Limits, from_lane
 from limsim_jax.traffic.engine import Command, Tick, Traffic, drive
 from limsim_jax.traffic.motion import boxes
-from limsim_jax.traffic.sumo_flows import SumoScenario, sumo_scenario
+from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config, Driver, Scenario, Schedule, Shape, State
 from limsim_jax.xla import enable_compilation_cache, use_all_cores
 

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from limsim_jax.maps.network import Lane as Lane
     from limsim_jax.maps.network import MapError as MapError
     from limsim_jax.maps.network import Network as Network
+    from limsim_jax.maps.origins import origins as origins
     from limsim_jax.simulation.rollout import Rollout as Rollout
     from limsim_jax.simulation.worlds import Worlds as Worlds
     from limsim_jax.traffic.demand import Flow as Flow
     from limsim_jax.traffic.demand import build_demand as build_demand
-    from limsim_jax.traffic.demand import entries as entries
     from limsim_jax.traffic.demand import sample_scenario as sample_scenario
     from limsim_jax.traffic.engine import Traffic as Traffic
     from limsim_jax.traffic.vehicles import default_population as default_population
@@ -47,7 +47,7 @@ _HOMES = {
     "bundled_maps": "limsim_jax.maps",
     "default_population": "limsim_jax.traffic.vehicles",
     "draw_map": "limsim_jax.maps.draw",
-    "entries": "limsim_jax.traffic.demand",
+    "origins": "limsim_jax.maps.origins",
     "fitting": "limsim_jax.traffic.vehicles",
     "load_map": "limsim_jax.maps",
     "sample_scenario": "limsim_jax.traffic.demand",
@@ -69,9 +69,9 @@ __all__ = [
     "bundled_maps",
     "default_population",
     "draw_map",
-    "entries",
     "fitting",
     "load_map",
+    "origins",
     "sample_scenario",
 ]
 

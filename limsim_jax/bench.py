@@ -193,7 +193,7 @@ def build_traffic(
 ) -> tuple[Demand, int]:
     """Plain traffic: the default population that fits the map, from all origins to all goals.
 
-    A map without entries has traffic come in at the beginnings of a dozen of its roads.
+    On a map without origins, traffic enters at the start of a dozen of its roads.
 
     Args:
         network: the map.
@@ -208,15 +208,16 @@ def build_traffic(
     Raises:
         ValueError: numbers that make no sense, or more vehicles than the roads hold.
     """
+    from limsim_jax.maps.origins import origins, road_origins
     from limsim_jax.maps.routing import default_goals
-    from limsim_jax.traffic.demand import Flow, beginnings, build_demand, entries
+    from limsim_jax.traffic.demand import Flow, build_demand
     from limsim_jax.traffic.vehicles import default_population, fitting
 
-    origins = list(entries(network)) or beginnings(network, 12)
-    flows = [Flow(origin=name, rate=rate) for name in origins]
+    names = list(origins(network)) or road_origins(network, 12)
+    flows = [Flow(origin=name, rate=rate) for name in names]
     goals, population = default_goals(network), fitting(default_population(), lane_map)
     demand = build_demand(network, lane_map, goals, flows, population, horizon=seconds, vehicles=vehicles)
-    return demand, len(origins)
+    return demand, len(names)
 
 
 def markdown(result: dict[str, Any]) -> str:

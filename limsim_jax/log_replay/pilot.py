@@ -16,9 +16,9 @@ from limsim_jax.log_replay.scene import Scene
 from limsim_jax.log_replay.takeover import Ego, Flight, Moment
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, to_frenet
 from limsim_jax.policies.base import Policy
-from limsim_jax.traffic.demand import start_state
 from limsim_jax.traffic.ego import Control, Limits, step_free, track
 from limsim_jax.traffic.engine import Command
+from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config, Egos, Shape, State
 
 PLANNED = 10

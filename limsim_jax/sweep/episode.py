@@ -22,6 +22,7 @@ import limsim_jax
 from limsim_jax.maps import build_lane_map, bundled_maps, load_map
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import MapError, Network
+from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.xml import file_hash
 from limsim_jax.metrics.blame import Responsibility
@@ -40,7 +41,7 @@ from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweep.experiment import Bounds, EgoTable, Experiment, ExperimentError
 from limsim_jax.sweep.store import Outcome
 from limsim_jax.traffic import car_following
-from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand, entries, sample_scenario
+from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Command, Traffic
 from limsim_jax.traffic.population_file import read_population
 from limsim_jax.traffic.vehicles import (
@@ -435,7 +436,7 @@ def _ego(
 
 def _start_lane(name: str, ego: EgoTable, network: Network) -> str:
     """The lane that the ego starts on."""
-    known = entries(network)
+    known = origins(network)
     if ego.start in network.lanes:
         lanes = [ego.start]
     elif ego.start in known:
@@ -451,7 +452,7 @@ def _start_lane(name: str, ego: EgoTable, network: Network) -> str:
         lanes = [lane.id for lane in first]
     if not lanes:
         raise ExperimentError(
-            f"{name}: ego.start: no entry, road or lane '{ego.start}'; entries are {', '.join(known)}"
+            f"{name}: ego.start: no origin, road or lane '{ego.start}'; origins are {', '.join(known)}"
         )
     rightmost = [lane for lane in lanes if network.lanes[lane].right not in lanes]
     ordered = rightmost[:1]
@@ -474,10 +475,10 @@ def _demand(
     goals: Mapping[str, tuple[str, ...]],
     egos: EgoStart,
 ) -> Demand:
-    traffic, origins = experiment.traffic, list(entries(network))
+    traffic, names = experiment.traffic, list(origins(network))
     flows = []
     for flow in traffic.flow:
-        for origin in origins if flow.origin == "*" else [flow.origin]:
+        for origin in names if flow.origin == "*" else [flow.origin]:
             fields: dict[str, Any] = flow.model_dump() | {"origin": origin}
             flows.append(Flow(**fields))
     try:

@@ -34,7 +34,7 @@ class Flow(_Table):
     """Vehicles that come in: see `traffic.demand.Flow`."""
 
     origin: str | list[str] = "*"
-    """Names as `limsim_jax.entries` has them, road or lane ids; "*": every entry of the map."""
+    """Names of `limsim_jax.origins`, road or lane ids; "*": every origin of the map."""
     rate: NotNegative
     """Vehicles per hour, of each origin."""
     goal: str | dict[str, float] | None = None

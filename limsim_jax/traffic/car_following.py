@@ -238,6 +238,17 @@ def _constant_acceleration_heuristic(
     return jnp.where(leader_stops, stopping, a_lead - closing * closing / (2 * s))
 
 
+def safe_speed(driver: Driver, gap: Float[Array, " N"], v_lead: Float[Array, " N"]) -> Float[Array, " N"]:
+    """Speed (m/s) from which a driver who reacts after T and brakes with b keeps s0 behind the leader.
+
+    Gipps (1981), Transp. Res. B 15, 105, eq. 8, for a leader that brakes as hard. At the leader's speed
+    where the gap is s0 + v T.
+    """
+    bt = driver.b * driver.T
+    square = bt * bt + v_lead * v_lead + 2 * driver.b * (gap - driver.s0)
+    return jnp.maximum(safe_sqrt(square) - bt, 0)
+
+
 __all__ = [
     "ACC",
     "IDM",
@@ -249,5 +260,6 @@ __all__ = [
     "equilibrium_flow",
     "equilibrium_gap",
     "per_obstacle",
+    "safe_speed",
     "string_stability",
 ]

@@ -15,10 +15,10 @@ from limsim_jax.geometry import box_separation
 from limsim_jax.maps.lane_map import build_lane_map, lane_rows
 from limsim_jax.maps.network import ImportReport
 from limsim_jax.metrics.observer import _zones
-from limsim_jax.traffic.demand import start_state
 from limsim_jax.traffic.engine import Command, Traffic, _until_changed, drive
 from limsim_jax.traffic.lane_change import place_beside
 from limsim_jax.traffic.motion import boxes, tails
+from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config
 
 CUT = 10.0  # m of the turn in its first piece: it has parted from the straight way by 0.8 m there

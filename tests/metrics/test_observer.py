@@ -22,10 +22,10 @@ from limsim_jax.metrics.observer import EvaluateEgo, StepRecord, _meets_ego
 from limsim_jax.metrics.safety import NO_GAP
 from limsim_jax.metrics.traffic import TrafficMetrics, TrafficStep
 from limsim_jax.traffic.collision import off_road
-from limsim_jax.traffic.demand import start_state
 from limsim_jax.traffic.engine import Command, Tick
 from limsim_jax.traffic.motion import Decision, boxes
 from limsim_jax.traffic.neighbors import Obstacles, other_lane
+from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config, Egos, Shape, State, Status
 
 CONFIG = Config(dt=0.1)

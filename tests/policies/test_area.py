@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from traffic_worlds import bundled, scattered
 
+from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.simulation.rollout import Rollout, one_world
 from limsim_jax.simulation.trace import trace
-from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, entries, sample_scenario
+from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, sample_scenario
 from limsim_jax.traffic.ego import assign, from_lane, with_rows
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes
@@ -115,7 +116,7 @@ def test_a_vehicle_that_is_taken_starts_where_it_is_and_goes_on_from_there():
 def runs():
     """The same three worlds without and with an area in which traffic drives in the plane."""
     network, lane_map = bundled("roundabout")
-    flows = [Flow(origin=name, rate=350.0) for name in entries(network)]
+    flows = [Flow(origin=name, rate=350.0) for name in origins(network)]
     population = fitting(default_population(), lane_map)
     typical = uniform_population("car")
     vehicle = jnp.argmax(typical.share)[None].astype(jnp.int32)

@@ -9,6 +9,7 @@ import numpy as np
 from traffic_worlds import bundled, drivers, shapes, state_of
 
 from limsim_jax.maps.lane_map import NO_LANE, lane_rows
+from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic, variants
@@ -21,7 +22,7 @@ from limsim_jax.policies.predict import constant_velocity, straight
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.simulation.rollout import Rollout, one_world
 from limsim_jax.simulation.trace import trace
-from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, entries, sample_scenario
+from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, sample_scenario
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes
@@ -82,7 +83,7 @@ def test_room_for_a_lane_change():
 def runs():
     """Two worlds of the roundabout with an ego that LimSim-TM drives."""
     network, lane_map = bundled("roundabout")
-    flows = [Flow(origin=name, rate=350.0) for name in entries(network)]
+    flows = [Flow(origin=name, rate=350.0) for name in origins(network)]
     population = fitting(default_population(), lane_map)
     egos = EgoStart(driver=drivers(1), shape=shapes(1), free=jnp.asarray([True]))
     demand = build_demand(

@@ -11,6 +11,7 @@ from traffic_worlds import bundled
 
 from limsim_jax.cli.trace import write_trace
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES
+from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic
@@ -20,7 +21,7 @@ from limsim_jax.simulation.rollout import Rollout, world_key
 from limsim_jax.simulation.totals import count
 from limsim_jax.simulation.trace import trace
 from limsim_jax.simulation.worlds import Worlds
-from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, entries, sample_scenario
+from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.vehicles import default_population, fitting, sample_vehicles, uniform_population
 from limsim_jax.types import Config
@@ -33,7 +34,7 @@ RUN = Rollout(Config(dt=0.1), Traffic(), horizon=30.0)
 def sampler():
     """Scenarios on the bundled roundabout."""
     network, lane_map = bundled("roundabout")
-    flows = [Flow(origin=name, rate=350.0) for name in entries(network)]
+    flows = [Flow(origin=name, rate=350.0) for name in origins(network)]
     population = fitting(default_population(), lane_map)
     demand = build_demand(
         network, lane_map, default_goals(network), flows, population, horizon=RUN.horizon, density=4.0

@@ -10,7 +10,7 @@ import numpy as np
 from limsim_jax.maps import build_lane_map, bundled_map, load_map
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import Network
-from limsim_jax.traffic.demand import start_state
+from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Driver, Schedule, Shape, State
 
 

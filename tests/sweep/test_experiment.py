@@ -118,7 +118,7 @@ WRONG = {  # what to replace, by what, and the message
     "no such start": (
         'start = "6-"',
         'start = "x"',
-        "no entry, road or lane 'x'; entries are 1, 3",
+        "no origin, road or lane 'x'; origins are 1, 3",
     ),
     "a lane too many": ("s = 60.0", "s = 60.0\nlane = 7", "ego.lane: 7, but '6-' has lanes 0 to 1"),
     "a place beyond the lane": ("s = 60.0", "s = 6000.0", "ego.s: 6000 m, but lane '6_0_-2' is only 20"),

@@ -20,8 +20,10 @@ from traffic_worlds import bundled, drivers, shapes, state_of
 from limsim_jax.maps import load_map
 from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, build_lane_map, lane_ids, lane_rows
 from limsim_jax.maps.network import MapError
+from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.sumo_demand import read_demand
+from limsim_jax.traffic.car_following import safe_speed
 from limsim_jax.traffic.demand import (
     AT_ONCE,
     CHANGE_ROOM,
@@ -31,15 +33,13 @@ from limsim_jax.traffic.demand import (
     build_demand,
     delayed,
     enter,
-    entries,
     overflow,
-    safe_speed,
     sample_scenario,
-    start_state,
 )
+from limsim_jax.traffic.demand.sumo import sumo_scenario
 from limsim_jax.traffic.engine import Traffic, drive
 from limsim_jax.traffic.motion import boxes
-from limsim_jax.traffic.sumo_flows import sumo_scenario
+from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import default_population, uniform_population
 from limsim_jax.types import Config, Schedule
 
@@ -92,13 +92,13 @@ def arrivals(name, flow, n=16, **kwargs):
 
 
 def test_entries_are_the_ways_into_the_bundled_maps():
-    count = {name: {k: len(v) for k, v in entries(bundled(name)[0]).items()} for name in ("highway", "ramp")}
+    count = {name: {k: len(v) for k, v in origins(bundled(name)[0]).items()} for name in ("highway", "ramp")}
     assert count == {"highway": {"1-": 4, "2+": 4}, "ramp": {"1": 3, "4": 3, "5": 1}}
-    # of the four arms of the intersection two lanes each; the pockets that begin later are no entries
-    assert [len(lanes) for lanes in entries(bundled("intersection")[0]).values()] == [2, 2, 2, 2]
+    # of the four arms of the intersection two lanes each; the pockets that begin later are no origins
+    assert [len(lanes) for lanes in origins(bundled("intersection")[0]).values()] == [2, 2, 2, 2]
     for name in ("intersection", "roundabout", "long_route"):
         network, _ = bundled(name)
-        for lanes in entries(network).values():
+        for lanes in origins(network).values():
             assert all(not network.lanes[lane].predecessors for lane in lanes)
             assert all(network.lanes[lane].junction is None for lane in lanes)
 
@@ -224,7 +224,7 @@ def test_turning_ratios_and_classes():
     assert related.pvalue > 0.01, "independent"
     reachable = np.asarray(lane_map.routes.reachable)
     assert reachable[schedule.lane[used], schedule.goal[used]].all()
-    assert set(schedule.lane[used]) == {lane_rows(network)[lane] for lane in entries(network)["1"]}
+    assert set(schedule.lane[used]) == {lane_rows(network)[lane] for lane in origins(network)["1"]}
     # the front is where the body is just on the lane
     np.testing.assert_allclose(schedule.s[used], schedule.shape.length[used], rtol=1e-6)
 
@@ -279,7 +279,7 @@ def overlap(a, b):
 def test_vehicles_at_the_start(name, density):
     """Nobody overlaps, everybody can reach the goal, and all can follow and stop."""
     network, lane_map = bundled(name)
-    flows = [Flow(origin=list(entries(network)), rate=600.0)]
+    flows = [Flow(origin=list(origins(network)), rate=600.0)]
     demand = build(name, flows, default_population(), horizon=60.0, density=density)
     km = sum(lane.length for lane in network.drivable_lanes() if lane.junction is None) / 1000
     assert demand.initial == round(density * km)
@@ -447,7 +447,7 @@ def test_slots_that_run_out_are_counted_and_those_of_egos_stay_free():
 def test_origins_take_turns():
     """More origins than are looked at in one decision, and than there are slots."""
     network, lane_map = bundled("long_route")
-    lanes = [lane_rows(network)[x] for group in entries(network).values() for x in group]
+    lanes = [lane_rows(network)[x] for group in origins(network).values() for x in group]
     assert len(lanes) > AT_ONCE
     goal = [int(np.flatnonzero(row)[0]) for row in np.asarray(lane_map.routes.reachable)[lanes]]
     schedule = schedule_of(lanes, [[0.0] * 8] * len(lanes), 0, v=5.0)

@@ -19,11 +19,12 @@ from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.signals import SignalState, phase_at
 from limsim_jax.simulation.rollout import Rollout, world_key
 from limsim_jax.traffic import right_of_way
-from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario, start_state
+from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Command, Traffic, decide, drive
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.right_of_way import Rows, travel_time
 from limsim_jax.traffic.signals import DETECTOR, GAP, switch
+from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import default_population
 from limsim_jax.types import Config, Lights
 

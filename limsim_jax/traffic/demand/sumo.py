@@ -15,7 +15,9 @@ from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, LaneMap, bucket, 
 from limsim_jax.maps.network import Lane, MapError, Network
 from limsim_jax.maps.routing import RouteTable, build_fixed_routes, build_routes
 from limsim_jax.maps.sumo_demand import Demand, Flow, Vehicle, VehicleType
-from limsim_jax.traffic.demand import NEVER, departure_place, entry_speed, start_state, typical_vehicles
+from limsim_jax.traffic.demand.arrays import NEVER
+from limsim_jax.traffic.demand.sample import departure_place, entry_speed, typical_vehicles
+from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import from_vtypes, sample_vehicles
 from limsim_jax.types import Queues, Scenario, Schedule
 

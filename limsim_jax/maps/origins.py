@@ -1,0 +1,61 @@
+"""Where traffic comes into a map."""
+
+from __future__ import annotations
+
+from limsim_jax.maps.network import Lane, Network
+
+LEAST_LENGTH = 60.0
+"""m: `road_origins` names no shorter road."""
+
+_NARROW = 2.0  # m: no vehicle enters on a narrower lane
+
+
+def origins(network: Network) -> dict[str, tuple[str, ...]]:
+    """The ways into a map: groups of lane ids by name.
+
+    One per road and direction by which traffic comes in: the first lanes, none of which has a drivable
+    predecessor. A lane that starts beside one that continues is no origin, nor is one narrower than a car.
+    Closed maps have none. Names are road ids, with `+` or `-` for the sign of the lane numbers where a
+    road has traffic both ways (OpenDRIVE).
+    """
+    return {
+        name: tuple(lane.id for lane in lanes if lane.width_at(min(5.0, lane.length)) >= _NARROW)
+        for name, lanes in road_starts(network).items()
+        if all(lane.junction is None for lane in lanes)
+        and not any(_drivable(network, x) for lane in lanes for x in lane.predecessors)
+    }
+
+
+def road_origins(network: Network, count: int) -> list[str]:
+    """Names of at most `count` roads that serve as origins on a map without `origins`.
+
+    Spread evenly over the map's list of roads; none is shorter than `LEAST_LENGTH`.
+    """
+    names = [
+        name
+        for name, lanes in road_starts(network).items()
+        if all(lane.junction is None and lane.length > LEAST_LENGTH for lane in lanes)
+    ]
+    return names[:: -(-len(names) // count)] if names else []
+
+
+def _drivable(network: Network, name: str) -> bool:
+    return name in network.lanes and network.lanes[name].drivable
+
+
+def road_starts(network: Network) -> dict[str, list[Lane]]:
+    """The first lanes of every road and direction, by name."""
+    sides: dict[tuple[str, int, bool], list[Lane]] = {}
+    for lane in network.drivable_lanes():
+        sides.setdefault((lane.road, lane.section, lane.number < 0), []).append(lane)
+    ways = {(road, backward) for road, _, backward in sides}
+    first: dict[str, list[Lane]] = {}
+    for (road, _, backward), lanes in sides.items():
+        both = (road, not backward) in ways
+        name = road + (("-" if backward else "+") if both else "")
+        comes_from = {
+            network.lanes[x].road for lane in lanes for x in lane.predecessors if x in network.lanes
+        }
+        if road not in comes_from:
+            first.setdefault(name, []).extend(lanes)
+    return first

@@ -1,0 +1,265 @@
+"""A world from a seed, on the device: start state and schedule.
+
+Draws are keyed by place and number: vehicle k of a queue is the same whatever the other flows are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from limsim_jax.maps.lane_map import (
+    NO_LANE,
+    LaneMap,
+    bend_speed,
+    curvature,
+)
+from limsim_jax.numerics import safe_sqrt
+from limsim_jax.traffic.car_following import desired_speed, safe_speed
+from limsim_jax.traffic.demand.arrays import FLOW_BITS, NEVER, Demand, EgoStart
+from limsim_jax.traffic.ego import from_lane
+from limsim_jax.traffic.motion import boxes
+from limsim_jax.traffic.neighbors import neighbors, sort_vehicles
+from limsim_jax.traffic.state import start_state
+from limsim_jax.traffic.vehicles import BODY, PARAMETERS, Population, sample_vehicles
+from limsim_jax.types import Config, Driver, Queues, Scenario, Schedule, Shape, State
+
+_WALL_ROOM = 12.0  # m before the end of a lane that leads nowhere, kept free to change lanes
+_LOOK = 4  # lanes ahead of the departure lane that limit the speed
+_BEND_POINTS = 4  # places on the departure lane at which the bend is looked at
+_LOOK_CONFIG = Config(dt=0.1)  # how far vehicles at the start look for their leaders; only that counts
+_SWEEPS = 8  # times that the speeds at the start are adjusted to those of the leaders
+_FAR = 1e6  # m, of who is not there
+
+# Purposes of keys.
+_ARRIVALS, _SEATS, _ROLES, _VEHICLES = range(4)
+
+
+def sample_scenario(
+    demand: Demand, lane_map: LaneMap, key: Key[Array, ""], slots: int, egos: EgoStart | None = None
+) -> Scenario:
+    """Draw one world: who is there at the start, and who comes later.
+
+    Args:
+      demand: from `build_demand`.
+      lane_map: the one that the demand was built for.
+      key: of the tables.
+      slots: number of vehicle slots `N`.
+      egos: the ones that the demand was built with; they are in slots 0 to `E - 1`.
+
+    Raises:
+      ValueError: more vehicles at the start than slots.
+    """
+    placed = egos is not None and egos.lane is not None
+    initial = demand.initial + (egos.count if egos is not None and placed else 0)
+    if egos is not None and initial < egos.count:
+        raise ValueError(f"{egos.count} egos cannot take the places of {initial} vehicles at the start")
+    if initial > slots:
+        raise ValueError(f"{initial} vehicles at the start do not fit into {slots} slots")
+    time, lane, place, stream = _sample_queues(demand, key)
+    seat, shift = _sample_seats(demand, key)
+    # those of the queues first, then those in the seats
+    number = jnp.concatenate([(lane << FLOW_BITS) + place, -1 - seat])
+    goals = jnp.concatenate([demand.goals[stream], demand.seat_goals[seat]])
+    types = jnp.concatenate([demand.types[stream], demand.seat_types[seat]])
+    goal, vehicle_type = _sample_roles(jax.random.fold_in(key, _ROLES), number, goals, types)
+    key = jax.random.fold_in(key, _VEHICLES)
+    driver, shape = sample_vehicles(demand.population, key, number, vehicle_type)
+    rows = time.shape[0]
+    lane = jnp.concatenate([lane, demand.seat_lane[seat]])
+    s = jnp.concatenate(
+        [
+            departure_place(lane_map, lane[:rows], shape.length[:rows]),
+            demand.seat_s[seat] + shift * demand.seat_slack[seat],
+        ]
+    )
+    v = entry_speed(lane_map, driver, lane, s, goal)
+    later, now = (
+        jax.tree.map(lambda x: x[part], (driver, shape, lane, s, v, goal))  # noqa: B023
+        for part in (slice(rows), slice(rows, None))
+    )
+    driver, shape, lane, s, v, goal = later
+    v = jnp.minimum(v, demand.speed[stream])
+    schedule = Schedule(
+        time=time, lane=lane, s=s, v=v, goal=goal, driver=driver, shape=shape, start=demand.start
+    )
+    if egos is not None:
+        now = _with_egos(lane_map, egos, now)
+    state = _start(demand, lane_map, slots, *now)
+    if egos is not None:
+        box = boxes(lane_map, state)
+        state = replace(state, egos=from_lane(lane_map, state, box, range(egos.count), egos.free))
+    return Scenario(start=state, schedule=schedule)
+
+
+def _with_egos(lane_map: LaneMap, egos: EgoStart, others: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Driver, shape, lane, s, v and goal of who is there at the start, egos first."""
+    _, _, lane, s, _, goal = jax.tree.map(lambda x: x[: egos.count], others)
+    rest = jax.tree.map(lambda x: x[egos.count :], others)
+    if egos.lane is not None and egos.s is not None and egos.goal is not None:
+        lane, s, goal, rest = egos.lane, egos.s, egos.goal, others
+    v = entry_speed(lane_map, egos.driver, lane, s, goal)
+    v = v if egos.v is None else jnp.minimum(egos.v, v)
+    them = egos.driver, egos.shape, lane, s, v, goal
+    return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), them, rest)
+
+
+def overflow(demand: Demand, key: Key[Array, ""]) -> Bool[Array, ""]:
+    """Whether more vehicles come in this world than the schedule has rows for (the host should raise).
+
+    The chance is `RARE` per flow and lane, unless rates were changed after `build_demand`.
+    """
+    time = _sample_arrivals(demand, key)
+    last = jnp.take_along_axis(time, demand.capacity[:, None] - 1, 1)[:, 0]
+    return (last < NEVER).any()
+
+
+def _sample_arrivals(demand: Demand, key: Key[Array, ""]) -> Float[Array, "K A"]:
+    """Times of the arrivals of every stream in order, `NEVER` after its end.
+
+    The process is stationary from `begin` on: that falls into a platoon or between two by their shares.
+    """
+    key = jax.random.fold_in(key, _ARRIVALS)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, demand.stream)
+    draws = jax.vmap(lambda k: jax.random.uniform(k, (demand.arrivals + 1,)))(keys)
+    headway, size = demand.headway[:, None], demand.size[:, None]
+    block = size.astype(headway.dtype) * headway
+    # s since the last platoon began, and how many of it have passed; its whole block between platoons
+    passed = jnp.minimum(draws[:, :1] * (block + demand.idle[:, None]), block)
+    done = jnp.ceil(passed / jnp.where(headway > 0, headway, 1)).astype(jnp.int32)
+    place = jnp.minimum(done, size) + jnp.arange(demand.arrivals, dtype=jnp.int32)[None]
+    pause = jnp.where(place % size == 0, -jnp.log1p(-draws[:, 1:]) * demand.idle[:, None], 0)
+    since = jnp.cumsum(pause, -1) + place.astype(headway.dtype) * headway - passed
+    time = demand.begin[:, None] + since
+    return jnp.where(time < demand.end[:, None], time, NEVER)
+
+
+def _sample_queues(
+    demand: Demand, key: Key[Array, ""]
+) -> tuple[Float[Array, " V"], Int[Array, " V"], Int[Array, " V"], Int[Array, " V"]]:
+    """Time, lane, place in the queue and stream of every row of the schedule."""
+    time = _sample_arrivals(demand, key)[demand.row_stream, demand.row_arrival]
+    time = jnp.where(demand.row_origin < demand.lane.shape[0], time, NEVER)
+    origin, time, stream = lax.sort((demand.row_origin, time, demand.row_stream), num_keys=2)
+    lane = demand.lane.at[origin].get(mode="fill", fill_value=NO_LANE)
+    return time, lane, jnp.arange(time.shape[0], dtype=jnp.int32) - demand.start[origin], stream
+
+
+def _sample_seats(demand: Demand, key: Key[Array, ""]) -> tuple[Int[Array, " M"], Float[Array, " M"]]:
+    """Seats that are taken, and where in them (0..1)."""
+    key = jax.random.fold_in(key, _SEATS)
+    seats = demand.seat_weight.shape
+    # weighted sampling without replacement: the largest sums of logarithm and Gumbel noise
+    chance = demand.seat_weight + jax.random.gumbel(jax.random.fold_in(key, 0), seats)
+    seat = lax.top_k(chance, demand.initial)[1] if demand.initial else jnp.zeros(0, jnp.int32)
+    return seat, jax.random.uniform(jax.random.fold_in(key, 1), seats)[seat]
+
+
+def _sample_roles(
+    key: Key[Array, ""], number: Int[Array, " V"], goals: Float[Array, "V G"], types: Float[Array, "V Y"]
+) -> tuple[Int[Array, " V"], Int[Array, " V"]]:
+    """Goal and type of every vehicle, by cumulative shares."""
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, number)
+    chance = jax.vmap(lambda k: jax.random.uniform(k, (2,)))(keys)
+    goal, vehicle_type = (
+        jnp.sum(chance[:, k, None] >= shares, -1, dtype=jnp.int32) for k, shares in enumerate((goals, types))
+    )
+    return goal, vehicle_type
+
+
+def departure_place(
+    lane_map: LaneMap, lane: Int[Array, " V"], length: Float[Array, " V"]
+) -> Float[Array, " V"]:
+    """Front bumper (m) of vehicles that enter where a lane starts: bodies on it, if it is long enough."""
+    most = lane_map.length[lane]
+    return jnp.minimum(length, jnp.maximum(most - 0.5, 0.5 * most))
+
+
+def entry_speed(
+    lane_map: LaneMap,
+    driver: Driver,
+    lane: Int[Array, " V"],
+    s: Float[Array, " V"],
+    goal: Int[Array, " V"],
+) -> Float[Array, " V"]:
+    """Speed (m/s) at which the road alone lets a vehicle start at `s` (m) of `lane` on its way to `goal`.
+
+    At most what its driver wants here, and what braking with `b` brings down in time to the limits and
+    bends of the next lanes, and to rest before a junction or the end of a lane that does not lead on.
+    """
+    here = lane_map.speed_limit[lane], curvature(lane_map, lane, s)
+    speed = desired_speed(driver, *here)
+    square = speed * speed
+    brake = 2 * driver.b
+    share = jnp.arange(1, _BEND_POINTS + 1, dtype=speed.dtype)[None] / _BEND_POINTS
+    reach = jnp.minimum(square / brake, lane_map.length[lane] - s)
+    bend = curvature(lane_map, lane[:, None], s[:, None] + reach[:, None] * share)
+    slow = driver.a_lat[:, None] / jnp.maximum(jnp.abs(bend), 1e-6)
+    square = jnp.minimum(square, (slow + (brake * reach)[:, None] * share).min(-1))
+    start = -s
+    for _ in range(_LOOK):
+        after = lane_map.routes.next_lane[lane, goal]
+        end = start + lane_map.length[lane]
+        wall = (after == NO_LANE) & ~lane_map.routes.is_goal[lane, goal] & (lane != NO_LANE)
+        stop = start + lane_map.stop_s[lane] - 1
+        stop = jnp.where(lane_map.is_connector[after] & ~lane_map.is_connector[lane], stop, _FAR)
+        stop = jnp.minimum(stop, jnp.where(wall, end - _WALL_ROOM, _FAR))
+        square = jnp.minimum(square, brake * jnp.maximum(stop, 0))
+        slow = jnp.minimum(
+            driver.speed_factor * lane_map.speed_limit[after], bend_speed(lane_map, after, driver.a_lat)
+        )
+        slow = jnp.where(after == NO_LANE, _FAR, slow)
+        square = jnp.minimum(square, slow * slow + brake * jnp.maximum(end, 0))
+        lane, start = after, end
+    return safe_sqrt(square)
+
+
+def _start(
+    demand: Demand,
+    lane_map: LaneMap,
+    slots: int,
+    driver: Driver,
+    shape: Shape,
+    lane: Int[Array, " M"],
+    s: Float[Array, " M"],
+    free: Float[Array, " M"],
+    goal: Int[Array, " M"],
+) -> State:
+    """The world before anybody enters; `free`: m/s on an empty road."""
+
+    def fill(x: Array, empty: Any) -> Array:
+        return jnp.concatenate([x, jnp.full(slots - x.shape[0], empty, x.dtype)])
+
+    rest = typical_vehicles(demand.population, slots - lane.shape[0])
+    driver, shape = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), (driver, shape), rest)
+    zero = jnp.zeros(slots, jnp.float32)
+    lane, s, goal = fill(lane, NO_LANE), fill(s, 0), fill(goal, 0)
+    state = start_state(lane_map, driver, shape, lane=lane, s=s, v=zero, goal=goal)
+    queues = Queues(next=demand.start[:-1], full=jnp.int32(0))
+    return replace(state, v=_start_speed(lane_map, state, fill(free, 0)), queues=queues)
+
+
+def _start_speed(lane_map: LaneMap, state: State, free: Float[Array, " N"]) -> Float[Array, " N"]:
+    """Speeds at which everybody can follow whoever is ahead, m/s, at most `free`."""
+    order = sort_vehicles(lane_map, state)
+    n = state.lane.shape[0]
+    here = state.lane[:, None], state.s[:, None], order.rank[:n, None] + 1
+    found = neighbors(_LOOK_CONFIG, lane_map, order, state, *here)
+    lead, gap = found.lead[:, 0], found.lead_gap[:, 0]
+    # From below: as the leader is at least that fast in the end, every speed on the way is safe.
+    v = jnp.zeros_like(free)
+    for _ in range(_SWEEPS):
+        v = jnp.where(lead >= 0, jnp.minimum(free, safe_speed(state.driver, gap, v[lead])), free)
+    return v
+
+
+def typical_vehicles(population: Population, n: int) -> tuple[Driver, Shape]:
+    """Medians of the first type of a population, `[n]`: harmless values for empty slots."""
+    values = {name: jnp.full(n, population.median[0, k]) for k, name in enumerate(PARAMETERS)}
+    body = {name: values.pop(name) for name in BODY}
+    return Driver(**values), Shape(**body, vehicle_class=jnp.full(n, population.vehicle_class[0]))

@@ -1,0 +1,83 @@
+"""Tables of a map and a population on the host, on which flows and seats are laid out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limsim_jax.maps.lane_map import (
+    LaneMap,
+    lane_rows,
+)
+from limsim_jax.maps.network import Network
+from limsim_jax.traffic.vehicles import PARAMETERS, Population
+
+CHANGE_ROOM, CHANGE_TIME = 60.0, 6.0
+"""m, and s at the speed limit, per lane to cross: who starts or enters is given no goal that leaves less."""
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Tables on the host: `L` rows and `G` goals of the lane map, `Y` types of vehicles."""
+
+    network: Network
+    goals: tuple[str, ...]
+    rows: dict[str, int]
+    classes: NDArray[np.int32]  # of the types of the population
+    shares: NDArray[np.float64]  # of the types of the population, adding up to 1
+    lengths: tuple[float, float]  # m, of the shortest and the longest vehicle
+    widths: NDArray[np.float64]  # [Y] m, of the widest vehicle of a type
+    allowed: NDArray[np.bool_]  # [L, Y] types on lanes
+    reachable: NDArray[np.bool_]  # [L, G]
+    lanes_to_go: NDArray[np.int_]  # [L, G]
+    change_distance: NDArray[np.float64]  # [L, G] m
+    speed_limit: NDArray[np.float64]  # [L] m/s
+
+    @staticmethod
+    def of(
+        network: Network, lane_map: LaneMap, goals: Mapping[str, Sequence[str]], population: Population
+    ) -> Tables:
+        """Tables of a map, its goals and a population. Raises `ValueError` if the goals do not fit."""
+        rows = lane_rows(network)
+        is_goal = np.asarray(lane_map.routes.is_goal)
+        for column, (name, lanes) in enumerate(goals.items()):
+            ends = [rows[lane] for lane in lanes if lane in rows]
+            if column >= is_goal.shape[1] or not ends or not is_goal[ends, column].all():
+                raise ValueError(
+                    f"goal '{name}' is not number {column} of the lane map, which has other goals"
+                )
+        share = np.asarray(population.share, float)
+        classes = np.asarray(population.vehicle_class)
+        length, width = PARAMETERS.index("length"), PARAMETERS.index("width")
+        least, most = np.asarray(population.lower, float), np.asarray(population.upper, float)
+        access = np.asarray(lane_map.access)
+        return Tables(
+            network=network,
+            goals=tuple(goals),
+            rows=rows,
+            classes=classes,
+            shares=share / share.sum(),
+            lengths=(float(least[share > 0, length].min()), float(most[share > 0, length].max())),
+            widths=most[:, width],
+            allowed=(access[:, None] >> classes) & 1 == 1,
+            reachable=np.asarray(lane_map.routes.reachable),
+            lanes_to_go=np.asarray(lane_map.routes.lanes_to_go),
+            change_distance=np.asarray(lane_map.routes.change_distance, float),
+            speed_limit=np.asarray(lane_map.speed_limit, float),
+        )
+
+    def leaves_room(self, row: Any, s: Any) -> NDArray[np.bool_]:
+        """Goals `[*b, G]` that leave room to change lanes to who is at `s` (m) of `row`."""
+        room = self.change_distance[row] - np.asarray(s)[..., None]
+        per_lane = np.maximum(CHANGE_ROOM, CHANGE_TIME * self.speed_limit[row])[..., None]
+        return self.reachable[row] & (room > per_lane * np.abs(self.lanes_to_go[row]))
+
+
+def cumulative(shares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cumulative shares along the last axis, exactly 1 from the last positive one on."""
+    total = np.cumsum(shares, -1)
+    return np.where(total >= total[..., -1:] * (1 - 1e-12), 1.0, total / total[..., -1:])
