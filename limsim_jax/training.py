@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.base import Policy
 from limsim_jax.policies.pdm import PDMClosed
-from limsim_jax.policies.pdm_learned import (
+from limsim_jax.policies.pdm.learned import (
     BEYOND,
     POSE_TIME,
     POSES,

@@ -18,6 +18,7 @@ ORDER = [
     {"numerics"},
     {"xla"},
     {"geometry"},
+    {"standards"},
     {"types"},
     {"maps"},
     {"traffic"},

@@ -32,18 +32,9 @@ from numpy.typing import NDArray
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.metrics.reductions import Least, Mean, Measured, measured
 from limsim_jax.numerics import masked_sum, safe_norm, safe_sqrt
+from limsim_jax.standards import COMFORT
 
 Floats = NDArray[np.float64]
-
-COMFORT = {
-    "acceleration": (-4.05, 2.40),  # m/s^2
-    "lateral_acceleration": (-4.89, 4.89),
-    "jerk": (-8.37, 8.37),  # m/s^3
-    "longitudinal_jerk": (-4.13, 4.13),
-    "yaw_acceleration": (-1.93, 1.93),  # rad/s^2
-    "yaw_rate": (-0.95, 0.95),  # rad/s
-}
-"""nuPlan's bounds of comfort (`ego_*.yaml` of the devkit)."""
 
 
 class Filter(NamedTuple):

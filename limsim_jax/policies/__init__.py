@@ -10,8 +10,7 @@ from collections.abc import Callable
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic, Policy
 from limsim_jax.policies.limsim_tm import LimSimTM
-from limsim_jax.policies.pdm import PDMClosed
-from limsim_jax.policies.pdm_learned import PDMHybrid
+from limsim_jax.policies.pdm import PDMClosed, PDMHybrid
 from limsim_jax.policies.simple import ConstantSpeed, FollowLane
 
 POLICIES: dict[str, Callable[..., Policy]] = {

@@ -7,7 +7,6 @@ import pytest
 from scipy import signal
 
 from limsim_jax.metrics.motion import (
-    COMFORT,
     filter_init,
     filter_result,
     filter_update,
@@ -18,6 +17,7 @@ from limsim_jax.metrics.motion import (
     stream,
 )
 from limsim_jax.metrics.reductions import on_host
+from limsim_jax.standards import COMFORT
 
 DT = 0.1
 

@@ -13,10 +13,12 @@ from traffic_worlds import bundled, drivers, no_arrivals, shapes, state_of
 from limsim_jax.geometry import boxes_overlap
 from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.signals import SignalState, lane_states
-from limsim_jax.metrics.motion import COMFORT as NUPLAN_COMFORT
 from limsim_jax.metrics.motion import motion_init, motion_result, motion_update
-from limsim_jax.policies import pdm
 from limsim_jax.policies.pdm import PDMClosed
+from limsim_jax.policies.pdm import proposals as pdm_proposals
+from limsim_jax.policies.pdm import road as pdm_road
+from limsim_jax.policies.pdm import score as pdm_score
+from limsim_jax.policies.pdm import tracker as pdm_tracker
 from limsim_jax.policies.reference import Way
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.trace import trace
@@ -27,22 +29,22 @@ from limsim_jax.types import Config
 
 CONFIG = Config(dt=0.1)
 N, K = 8, 6
-P = len(pdm.OFFSETS) * len(pdm.FRACTIONS)
+P = len(pdm_road.OFFSETS) * len(pdm_proposals.FRACTIONS)
 
 
 # --- parts, on a straight road along x --------------------------------------------------------------
 
 
-def body(v, d=(0.0, 0.4)) -> pdm.Body:
+def body(v, d=(0.0, 0.4)) -> pdm_road.Body:
     """Two vehicles of different sizes, the rear axle at x = 0."""
     row = lambda *values: jnp.array(values, jnp.float32)  # noqa: E731
-    return pdm.Body(
+    return pdm_road.Body(
         x=row(0.0, 0.0), y=row(*d), heading=row(0.0, 0.0), v=row(*v), a=row(0.0, 0.0),
         steering=row(0.0, 0.0), length=row(5.0, 4.0), width=row(2.0, 1.6), wheelbase=row(3.0, 2.4),
     )  # fmt: skip
 
 
-def straight_road(limit=(14.0, 20.0), wall=1e6, d=(0.0, 0.4)) -> pdm.Road:
+def straight_road(limit=(14.0, 20.0), wall=1e6, d=(0.0, 0.4)) -> pdm_road.Road:
     """A lane of 3.5 m with one to its left, and an oncoming lane beyond that; limits of two vehicles."""
     m = 121
     line = jnp.broadcast_to(2.0 * jnp.arange(m, dtype=jnp.float32), (2, m))
@@ -51,14 +53,14 @@ def straight_road(limit=(14.0, 20.0), wall=1e6, d=(0.0, 0.4)) -> pdm.Road:
         x=line, y=flat, heading=flat, curvature=flat, limit=flat + jnp.array(limit)[:, None],
         left=flat + 5.25, right=flat + 1.75, lane=flat.astype(jnp.int32), end=jnp.full(2, 1e6), step=2.0,
     )  # fmt: skip
-    return pdm.Road(
+    return pdm_road.Road(
         way=way, s=jnp.zeros(2), d=jnp.array(d), slope=jnp.zeros(2),
-        offset=jnp.broadcast_to(jnp.array(pdm.OFFSETS), (2, 3)), wall=jnp.full((2, 3), wall),
+        offset=jnp.broadcast_to(jnp.array(pdm_road.OFFSETS), (2, 3)), wall=jnp.full((2, 3), wall),
         worth=jnp.zeros((2, 3)), half=flat + 1.75, oncoming=flat + 3.5, connector=flat > 0,
     )  # fmt: skip
 
 
-def others(x, y, v, heading=None, length=4.5, moments=50) -> pdm.Others:
+def others(x, y, v, heading=None, length=4.5, moments=50) -> pdm_road.Others:
     """Others at constant speed along their headings; both vehicles see the same."""
     x, y, v = (np.broadcast_to(np.asarray(values, np.float32), (2, len(x))) for values in (x, y, v))
     heading = (
@@ -66,7 +68,7 @@ def others(x, y, v, heading=None, length=4.5, moments=50) -> pdm.Others:
     )
     t = 0.1 * np.arange(moments, dtype=np.float32)[:, None, None]
     row = lambda values: jnp.asarray(np.broadcast_to(values, (moments, *x.shape)), jnp.float32)  # noqa: E731
-    return pdm.Others(
+    return pdm_road.Others(
         x=row(x + v * t * np.cos(heading)), y=row(y + v * t * np.sin(heading)), cos=row(np.cos(heading)),
         sin=row(np.sin(heading)), length=jnp.full(x.shape, length), width=jnp.full(x.shape, 1.8),
         v=jnp.asarray(v), there=jnp.ones(x.shape, bool),
@@ -111,8 +113,8 @@ def test_idm_as_a_loop_has_it(strict):
     x, y, u = [40.0, 25.0, 70.0, -9.0, 60.0, 30.0], [0.2, 2.3, -1.9, 0.0, 14.0, 3.6], [5.0, 9, 2, 20, 6, 9]
     heading = [0.0, 0.05, 0.0, 0.0, -1.4, -0.02]
     me, road = body((12.0, 7.0)), straight_road(wall=95.0)
-    along = pdm._along(road, me, others(x, y, u, heading), pdm.STEPS)
-    found = pdm.idm(road, me, along, strict)
+    along = pdm_proposals.leaders(road, me, others(x, y, u, heading), pdm_road.STEPS)
+    found = pdm_proposals.idm(road, me, along, strict)
     for i, (v, limit) in enumerate(((12.0, 14.0), (7.0, 20.0))):
         half, size = float(me.wheelbase[i]) / 2, float(me.length[i])
         wide = float(me.width[i])
@@ -129,7 +131,7 @@ def test_who_is_too_near_brakes_hard():
     seen = others([rear + 2.25], [0.0], [0.0])
     way = []
     for strict in (False, True):
-        found = pdm.idm(road, me, pdm._along(road, me, seen, pdm.STEPS), strict)
+        found = pdm_proposals.idm(road, me, pdm_proposals.leaders(road, me, seen, pdm_road.STEPS), strict)
         way.append(np.asarray(found.s)[0, :, -1].max())
     # with 6 m/s^2, in steps of 0.1 s: 0.15 + 0.09 + 0.03 m
     assert way[0] == pytest.approx(0.27, abs=0.01) and way[1] > 0.4, way
@@ -141,7 +143,7 @@ def test_lqr_as_nuplan_writes_it():
     steering, lateral, astray = (rng.uniform(-0.3, 0.3, 7) for _ in range(3))
     bends, wheelbase = rng.uniform(-0.05, 0.05, (10, 7)), rng.uniform(2.4, 3.4, 7)
     as_32 = lambda value: jnp.asarray(value, jnp.float32)  # noqa: E731
-    a, rate = pdm.lqr(
+    a, rate = pdm_tracker.lqr(
         as_32(v), as_32(steering), as_32(lateral), as_32(astray), as_32(v_ahead),
         [as_32(b) for b in bends], as_32(wheelbase),
     )  # fmt: skip
@@ -159,7 +161,7 @@ def test_lqr_as_nuplan_writes_it():
         error[1:] = np.arctan2(np.sin(error[1:]), np.cos(error[1:]))
         assert rate[i] == pytest.approx(-(B @ Q @ error) / (B @ Q @ B + 1), rel=1e-3, abs=1e-5)
     v, steering, lateral, astray, v_ahead = (jnp.array([x]) for x in (0.1, 0.2, 0.5, 0.1, 0.0))
-    stands = pdm.lqr(v, steering, lateral, astray, v_ahead, [jnp.zeros(1)] * 10, jnp.full(1, 3.0))
+    stands = pdm_tracker.lqr(v, steering, lateral, astray, v_ahead, [jnp.zeros(1)] * 10, jnp.full(1, 3.0))
     assert float(stands[0][0]) == pytest.approx(-0.05) and float(stands[1][0]) == 0
 
 
@@ -168,7 +170,7 @@ def arc(v, radius, steps=81):
     v = np.broadcast_to(np.asarray(v, float), steps)
     angle = np.concatenate([[0.0], np.cumsum(0.1 * v[:-1])]) / radius
     row = lambda values: jnp.asarray(np.broadcast_to(values, (2, P, steps)), jnp.float32)  # noqa: E731
-    return pdm.Reference(
+    return pdm_proposals.Poses(
         x=row(radius * np.sin(angle)), y=row(radius * (1 - np.cos(angle))), heading=row(angle),
         v=row(v), curvature=row(np.full(steps, 1 / radius)),
     )  # fmt: skip
@@ -177,7 +179,7 @@ def arc(v, radius, steps=81):
 def test_the_tracker_stays_on_a_circle():
     me = body((8.0, 8.0))
     me = me._replace(steering=jnp.arctan(me.wheelbase / 30.0))
-    motion = pdm.drive_along(arc(8.0, 30.0), me, 80)
+    motion = pdm_tracker.drive_along(arc(8.0, 30.0), me, 80)
     off = np.hypot(motion.x, np.asarray(motion.y) - 30.0) - 30.0
     assert np.abs(off[0]).max() < 0.2 and np.abs(off[1, :, 40:]).max() < 0.25
     assert np.abs(off[1, :, 0]).max() > 0.35, "the second one starts beside it"
@@ -192,7 +194,9 @@ def test_the_bicycle_is_that_which_drives_the_egos():
     wave = arc(9.0, 30.0)
     turns = np.where(np.arange(81) % 20 < 10, 4.0, -4.0)
     sharp = wave._replace(curvature=wave.curvature * jnp.asarray(turns, jnp.float32)[None, None])
-    motion = jax.tree.map(lambda values: np.asarray(values, float)[0, 0], pdm.drive_along(sharp, me, 80))
+    motion = jax.tree.map(
+        lambda values: np.asarray(values, float)[0, 0], pdm_tracker.drive_along(sharp, me, 80)
+    )
     limits, wheelbase = Limits(), float(me.wheelbase[0])
     turned = np.diff(motion.steering)
     assert np.abs(turned).max() == pytest.approx(0.04, abs=1e-5), "0.4 rad/s"
@@ -214,7 +218,7 @@ def test_who_brakes_late_keeps_to_the_bend():
     late = arc(np.maximum(8.0 - 3.0 * 0.1 * np.arange(81), 3.0), 15.0)
     off = []
     for strict in (False, True):
-        motion = pdm.drive_along(late, me, 80, strict)
+        motion = pdm_tracker.drive_along(late, me, 80, strict)
         off.append(np.abs(np.hypot(motion.x, np.asarray(motion.y) - 15.0) - 15.0)[0, 0].max())
     assert off[0] < 0.04 and off[1] > 0.5, off
 
@@ -225,7 +229,7 @@ def test_the_bicycle_drives_a_circle():
     me = me._replace(steering=jnp.arctan(me.wheelbase / 300.0))
     off = []
     for strict in (False, True):
-        motion = pdm.drive_along(arc(20.0, 300.0), me, 80, strict)
+        motion = pdm_tracker.drive_along(arc(20.0, 300.0), me, 80, strict)
         off.append((np.hypot(motion.x, np.asarray(motion.y) - 300.0) - 300.0)[0, 0])
     assert np.abs(off[0]).max() < 0.005
     assert off[1].max() > 0.05
@@ -237,10 +241,10 @@ def test_fitted_profiles_are_those_of_a_smooth_path():
     s = 5 * t + 0.4 * t * t
     row = lambda values: jnp.asarray(np.broadcast_to(values, (2, P, 41)), jnp.float32)  # noqa: E731
     angle = s / 40.0
-    given = pdm.Reference(
+    given = pdm_proposals.Poses(
         row(40 * np.sin(angle)), row(40 * (1 - np.cos(angle))), row(angle), row(0 * t), row(0 * t)
     )
-    found = pdm.fitted(given)
+    found = pdm_tracker.fitted(given)
     # a step's speed is the mean over it; the penalty on the rate pulls the first curvatures towards 0
     np.testing.assert_allclose(found.v[0, 3, :-1], v[:-1] + 0.04, rtol=0.01)
     np.testing.assert_allclose(found.curvature[1, 7, 5:-5], 1 / 40.0, rtol=0.03)
@@ -249,13 +253,13 @@ def test_fitted_profiles_are_those_of_a_smooth_path():
 # --- scorer -----------------------------------------------------------------------------------------
 
 
-def paths(v: Any, y: Any = 0.0, y_rate: Any = 0.0, a: Any = None, steps: int = 41) -> pdm.Motion:
+def paths(v: Any, y: Any = 0.0, y_rate: Any = 0.0, a: Any = None, steps: int = 41) -> pdm_tracker.Motion:
     """Straight motions of proposals: speeds, offsets and drifts `[P]`, the rear axle at x = 0."""
     t = 0.1 * np.arange(steps)
     v, y, y_rate = (np.broadcast_to(np.asarray(x, float), P)[:, None] for x in (v, y, y_rate))
     a = np.zeros((P, steps)) if a is None else a
     row = lambda values: jnp.asarray(np.broadcast_to(values, (2, P, steps)), jnp.float32)  # noqa: E731
-    return pdm.Motion(
+    return pdm_tracker.Motion(
         x=row(v * t), y=row(y + y_rate * t), heading=row(0 * t), v=row(v + 0 * t), a=row(a),
         steering=row(0 * t),
     )  # fmt: skip
@@ -263,8 +267,8 @@ def paths(v: Any, y: Any = 0.0, y_rate: Any = 0.0, a: Any = None, steps: int = 4
 
 def scored(motion, *seen, strict=False, **more) -> dict[str, np.ndarray]:
     road, me = straight_road(d=(0.0, 0.0)), body((10.0, 10.0), d=(0.0, 0.0))
-    proposals = pdm.Proposals(motion.x, motion.v)
-    found = pdm.score(road, me, others(*seen, **more), proposals, motion, strict)
+    proposals = pdm_proposals.Proposals(motion.x, motion.v)
+    found = pdm_score.score(road, me, others(*seen, **more), proposals, motion, strict)
     return {name: np.asarray(value) for name, value in found._asdict().items()}
 
 
@@ -348,12 +352,12 @@ def test_meetings_are_what_boxes_say():
     heading = rng.uniform(-3, 3, K)
     motion = paths(rng.uniform(0.5, 12, P), rng.uniform(-2, 2, P), rng.uniform(-1, 1, P))
     me, seen = body((5.0, 5.0)), others(x, y, v, heading)
-    found = pdm._meetings(me, motion, seen)
+    found = pdm_score._meetings(me, motion, seen)
     overlap = jax.jit(jax.vmap(boxes_overlap))
     contact, first = np.full((P, K), 1e6), np.full((P, K), 1e6)
     for i in (1,):
         for k in range(21):
-            for n, ahead in enumerate(pdm.TTC):
+            for n, ahead in enumerate(pdm_score.TTC):
                 pairs = [(p, j) for p in range(P) for j in range(K)]
                 mine = np.array([
                     (motion.x[i, p, 2 * k] + me.wheelbase[i] / 2 + motion.v[i, p, 2 * k] * ahead,
@@ -373,7 +377,6 @@ def test_meetings_are_what_boxes_say():
 
 
 def test_comfort_is_nuplans():
-    assert pdm.COMFORT == NUPLAN_COMFORT
     t = 0.1 * np.arange(41)
     a = np.zeros((P, 41))
     a[1], a[2], a[3] = 2.0 * np.sin(2 * t), 2.0 * np.sin(4 * t), 3.0
@@ -383,7 +386,7 @@ def test_comfort_is_nuplans():
     steering = np.arctan(0.3 * np.asarray(np.gradient(heading, 0.1, axis=1)))
     row = lambda values: jnp.asarray(np.broadcast_to(values, (2, P, 41)), jnp.float32)  # noqa: E731
     motion = paths(10.0, a=a)._replace(heading=row(heading), steering=row(steering))
-    found = np.asarray(pdm._comfort(body((10.0, 10.0)), motion))[0]
+    found = np.asarray(pdm_score._comfort(body((10.0, 10.0)), motion))[0]
     wanted = []
     for p in range(8):
         carry = motion_init(0.1)
@@ -558,12 +561,13 @@ def test_who_changes_lanes_signals_and_keeps_the_body_on_the_road():
     assert np.asarray(planned("ramp", state, strict=True).signal).tolist() == [0, 0]
     state = dataclasses.replace(state, shape=dataclasses.replace(state.shape, width=state.shape.width + 0.6))
     half = float(state.shape.width[1]) / 2
-    body, slot = pdm.bodies(state, jnp.arange(2)), jnp.arange(2)
+    body, slot = pdm_road.bodies(state, jnp.arange(2)), jnp.arange(2)
     ours, theirs = (
-        np.asarray(pdm.road_ahead(lane_map, state, slot, body, strict).offset[1]) for strict in (False, True)
+        np.asarray(pdm_road.road_ahead(lane_map, state, slot, body, strict).offset[1])
+        for strict in (False, True)
     )
-    np.testing.assert_allclose(theirs, pdm.OFFSETS)
-    free = 3.75 / 2 - half - pdm._EDGE
+    np.testing.assert_allclose(theirs, pdm_road.OFFSETS)
+    free = 3.75 / 2 - half - pdm_road.EDGE_MARGIN
     assert free < 0.9
     np.testing.assert_allclose(ours, [0, -free, 1], atol=0.01)
 

@@ -10,9 +10,8 @@ import pytest
 from traffic_worlds import bundled, state_of
 
 from limsim_jax.maps.lane_map import lane_rows
-from limsim_jax.policies import pdm_learned
-from limsim_jax.policies.pdm import PDMClosed
-from limsim_jax.policies.pdm_learned import (
+from limsim_jax.policies.pdm import PDMClosed, learned
+from limsim_jax.policies.pdm.learned import (
     BEYOND,
     Features,
     Offset,
@@ -135,7 +134,7 @@ def test_an_untrained_network_is_the_plan():
 
 
 def test_weights_that_are_none_are_named(tmp_path):
-    assert pdm_learned.WEIGHTS.stat().st_size < 1e6
+    assert learned.WEIGHTS.stat().st_size < 1e6
     with pytest.raises(ValueError, match=r"missing\.npz: no weights of PDM-Hybrid"):
         PDMHybrid(weights=str(tmp_path / "missing.npz"))
     np.savez(tmp_path / "other.npz", a=np.zeros(3))

@@ -24,7 +24,8 @@ from jaxtyping import Array, Float
 from limsim_jax.files import write_whole
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.pdm import DT, STEPS, PDMClosed, Plan, bodies, road_ahead
+from limsim_jax.policies.pdm.policy import PDMClosed, Plan
+from limsim_jax.policies.pdm.road import DT, STEPS, bodies, road_ahead
 from limsim_jax.policies.reference import place_on
 from limsim_jax.traffic.ego import Trajectory
 from limsim_jax.traffic.engine import Command

@@ -1,0 +1,157 @@
+"""PDM-Closed as a policy: the best proposal, or emergency braking."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.numerics import safe_norm
+from limsim_jax.policies.base import Policy
+from limsim_jax.policies.pdm.proposals import FRACTIONS, idm, leaders, poses
+from limsim_jax.policies.pdm.road import DT, STEPS, Body, bodies, others_around, road_ahead
+from limsim_jax.policies.pdm.score import TTC, Scores, score
+from limsim_jax.policies.pdm.tracker import STOPPING_SPEED, drive_along, fitted
+from limsim_jax.policies.predict import Predictor, straight
+from limsim_jax.policies.simple import FollowLane
+from limsim_jax.standards import COMFORT
+from limsim_jax.traffic.ego import Trajectory
+from limsim_jax.traffic.engine import Command
+from limsim_jax.types import Config, State
+from limsim_jax.xla import computed_once
+
+EMERGENCY_TIME, EMERGENCY_SPEED, EMERGENCY_BRAKING = 2.0, 5.0, 7.0
+"""s to a contact by the own fault that lead to emergency braking; m/s up to which they do in the public
+implementation; m/s^2 of braking in ours."""
+
+_AS_GOOD = 1e-3  # scores that differ by less are equal
+
+
+class Plan(NamedTuple):
+    """What was decided, for `V` vehicles."""
+
+    trajectory: Trajectory  # [V T], centre of the body
+    best: Int[Array, " V"]  # proposal
+    signal: Int[Array, " V"]  # +1 or -1 if it leads into the lane to the left or right
+    brakes: Bool[Array, " V"]  # emergency
+    scores: Scores
+    tail: Trajectory  # [V T'], the proposal beyond the trajectory
+
+
+@dataclass(frozen=True)
+class PDMClosed:
+    """PDM-Closed as a policy; its egos move in the plane.
+
+    Attributes:
+      seen: the nearest others that count.
+      strict_tuplan: the conventions of the public implementation; the module's docstring has them.
+      predict: forecast of the others.
+    """
+
+    seen: int = 32
+    strict_tuplan: bool = False
+    predict: Predictor = straight
+
+    free = True
+    others = 0
+
+    def __post_init__(self) -> None:
+        if self.seen < 1:
+            raise ValueError(f"seen: {self.seen} others; at least 1")
+
+    def variants(self, seen: Predictor) -> dict[str, Policy]:
+        """With a reference in the place of a module: what came to pass, car following on its lane."""
+        return {"prediction": replace(self, predict=seen), "planning": FollowLane()}
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """Nothing to remember."""
+        del config, lane_map, state
+
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
+    ) -> tuple[Command, Any]:
+        """The best proposal as a trajectory over 4 s."""
+        del key
+        plan = self.plan(config, lane_map, state)
+        return Command(trajectory=plan.trajectory, signal=plan.signal), memory
+
+    def plan(self, config: Config, lane_map: LaneMap, state: State, beyond: int = 0) -> Plan:
+        """The decision, and the chosen proposal for so many steps of `DT` beyond its trajectory."""
+        strict, slot = self.strict_tuplan, state.egos.slot
+        steps = STEPS + beyond
+        body = computed_once(bodies(state, slot))
+        road = computed_once(road_ahead(lane_map, state, slot, body, strict))
+        moments = max(steps, STEPS + round(TTC[-1] / DT)) + 1
+        others = others_around(lane_map, state, slot, self.predict, self.seen, moments)
+        others = computed_once(others)
+        along = computed_once(leaders(road, body, others, steps))
+        proposals = computed_once(idm(road, body, along, strict))
+        lead = computed_once(poses(road, body, proposals, strict))
+        motion = computed_once(drive_along(fitted(lead) if strict else lead, body, STEPS, strict))
+        scores = score(road, body, others, proposals, motion, strict)
+        # of proposals that are as good the first one: the middle of the lane, and the slower one
+        slack = 0.0 if strict else _AS_GOOD
+        best = jnp.argmax(scores.total >= jnp.max(scores.total, -1, keepdims=True) - slack, -1)
+        pick = lambda values: jnp.take_along_axis(values, best[:, None, None], 1)[:, 0]  # noqa: E731
+        x, y, heading, v = (pick(values) for values in motion[:4])
+        path = (best // len(FRACTIONS))[:, None]
+        leads, offset = (jnp.take_along_axis(x, path, 1)[:, 0] for x in (road.worth > 0, road.offset))
+        brakes = jnp.take_along_axis(scores.contact, best[:, None], 1)[:, 0] <= EMERGENCY_TIME
+        if strict:
+            brakes &= body.v <= EMERGENCY_SPEED
+            stop = _stop_straight(body)
+        else:
+            stop = _stop_along(body, x, y, heading)
+        now = config.time(state.step)
+        halt = brakes[:, None]
+        driven = tuple(jnp.where(halt, a, b) for a, b in zip(stop, (x, y, heading, v), strict=True))
+        rest = (pick(values)[:, STEPS + 1 :] for values in lead[:4])
+        rest = tuple(jnp.where(halt, a[:, -1:], b) for a, b in zip(driven, rest, strict=True))
+        return Plan(
+            trajectory=_centred(body, driven, now),
+            best=best,
+            signal=jnp.where(leads, jnp.sign(offset - road.d), 0).astype(jnp.int32),
+            brakes=brakes,
+            scores=scores,
+            tail=_centred(body, rest, now + (STEPS + 1) * DT),
+        )
+
+
+def _centred(body: Body, poses: tuple[Array, ...], t0: Array) -> Trajectory:
+    """Poses of the rear axle (x, y, heading, and speed) as a trajectory of the centre of the body."""
+    x, y, heading, v = poses
+    axle = body.wheelbase[:, None] / 2
+    return Trajectory(
+        x=x + axle * jnp.cos(heading), y=y + axle * jnp.sin(heading), heading=heading, v=v, t0=t0, dt=DT
+    )
+
+
+def _stop_along(body: Body, x: Array, y: Array, heading: Array) -> tuple[Array, ...]:
+    """The same path of the rear axle, braked with `EMERGENCY_BRAKING` to a standstill."""
+    t, v0 = DT * jnp.arange(STEPS + 1, dtype=x.dtype)[None], body.v[:, None]
+    braking = jnp.minimum(t, v0 / EMERGENCY_BRAKING)
+    way = v0 * braking - EMERGENCY_BRAKING * braking * braking / 2
+    steps = safe_norm(jnp.stack([jnp.diff(x), jnp.diff(y)]), 0)
+    done = jnp.pad(jnp.cumsum(steps, -1), ((0, 0), (1, 0)))
+    x, y, heading = (jax.vmap(jnp.interp)(way, done, values) for values in (x, y, heading))
+    return x, y, heading, v0 - EMERGENCY_BRAKING * braking
+
+
+def _stop_straight(body: Body) -> tuple[Array, ...]:
+    """Poses of the rear axle straight on, at the speed that nuPlan's tracker is to be given."""
+    t, v0 = DT * jnp.arange(STEPS + 1, dtype=body.v.dtype)[None], body.v[:, None]
+    u = jnp.where(v0 > STOPPING_SPEED, -10 * v0, -4 * v0 - body.a[:, None])
+    low, high = COMFORT["acceleration"]
+    speed = 1.1 * (v0 + jnp.clip(u, low, high))
+    heading = jnp.broadcast_to(body.heading[:, None], (*body.v.shape, STEPS + 1))
+    way = speed * t
+    return (
+        body.x[:, None] + way * jnp.cos(heading),
+        body.y[:, None] + way * jnp.sin(heading),
+        heading,
+        jnp.where(t > 0, speed, v0),
+    )
