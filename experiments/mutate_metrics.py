@@ -56,7 +56,6 @@ TESTS = {
     "scores": ("scores", "episode"),
     "traffic": ("traffic",),
     "episode": ("episode",),
-    "intervals": ("intervals",),
     "observer": ("observer",),
 }
 """The tests of each module, the nearest first."""
@@ -108,19 +107,6 @@ SAME: dict[tuple[str, str, str], str] = {
     ("observer", "_look", "0 → 1"): "filled in by `_step`",
     ("observer", "_zones", "1 → 2"): "before the lane in any case",
     ("episode", "EgoMetrics._update", "0.01 → 0.036000000000000004"): "tolerance of rounding",
-    ("intervals", "", "10000 → 10001"): "within the noise of resampling",
-    ("intervals", "", "2 → 3"): MEMORY,
-    ("intervals", "", "22 → 23"): MEMORY,
-    ("intervals", "bootstrap", "0 → 1"): "another seed of the resampling",
-    ("intervals", "bootstrap", "1 → 2"): MEMORY,
-    ("intervals", "paired_difference", "0 → 1"): "another seed of the resampling",
-}
-SAME |= {
-    ("intervals", "bootstrap", f"{one} → {other}"): MEMORY
-    for one, other in (
-        ("max(1, min(resamples, _BATCH // x.size))", "min(1, min(resamples, _BATCH // x.size))"),
-        ("min(resamples, _BATCH // x.size)", "max(resamples, _BATCH // x.size)"),
-    )
 }
 """(module, function, change): why the mutants behave as the original does."""
 

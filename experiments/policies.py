@@ -23,7 +23,7 @@ from readme_tables import PAPER, policies
 
 from limsim_jax.bench import bench_policy
 from limsim_jax.files import write_whole
-from limsim_jax.metrics.intervals import bootstrap, wilson
+from limsim_jax.statistics import bootstrap, wilson
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.sweep.experiment import read_experiments
 from limsim_jax.sweep.runner import Progress, sweep

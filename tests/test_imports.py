@@ -20,6 +20,7 @@ ORDER = [
     {"geometry"},
     {"standards"},
     {"types"},
+    {"statistics"},
     {"maps"},
     {"traffic"},
     {"policies"},

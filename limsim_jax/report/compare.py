@@ -8,13 +8,11 @@ succeeds and the other does not. p-values of one comparison are adjusted togethe
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from limsim_jax.report.tables import (
     Group,
@@ -23,17 +21,15 @@ from limsim_jax.report.tables import (
     columns,
     groups,
     kind_of,
-    mean_intervals,
     metrics_of,
     null,
     number_text,
     with_shares,
 )
+from limsim_jax.statistics import check_level, holm, mcnemar, mean_intervals, paired_t
 
 if TYPE_CHECKING:
     from limsim_jax.sweep.store import Results
-
-Floats = NDArray[np.float64]
 
 _UNDER_TEST = {"name", "description", "ego.policy", "ego.options", "ego.driver"}
 _VERSION = ("version", "source", "platform", "machine", "jax", "jaxlib")
@@ -83,8 +79,7 @@ def compare(
     Raises:
       ValueError: nothing in common, or another map, demand or rule in A than in B; one line that names it.
     """
-    if not 0 < level < 1:
-        raise ValueError(f"the level must lie between 0 and 1, not {level!r}; 95 % is 0.95")
+    check_level(level)
     b = a if b is None else b
     parts_a, parts_b = groups(a), groups(b)
     pairs = _pairs(a, b, parts_a, parts_b, policies)
@@ -96,7 +91,7 @@ def compare(
         found, said = _compared(a, b, parts_a[first], parts_b[second], first, second, level)
         rows += found
         notes += said
-    for row, p in zip(rows, _holm([row["p"] for row in rows]), strict=True):
+    for row, p in zip(rows, holm([row["p"] for row in rows]), strict=True):
         row["p_adjusted"] = p
         sign = better(row["metric"]) * float(np.sign(row["difference"]))
         row["better"] = {1: "B", -1: "A"}.get(int(sign)) if p <= 1 - level else None
@@ -252,33 +247,3 @@ def _compared(
             row |= dict(a_not_b=lost, b_not_a=won, p=mcnemar(lost, won))
         rows.append(row)
     return rows, notes
-
-
-def mcnemar(a_not_b: int, b_not_a: int) -> float:
-    """Two-sided exact p-value: the chance of a split at least as uneven if both ways were as likely."""
-    from scipy.special import bdtr
-
-    n = a_not_b + b_not_a
-    return min(1.0, 2 * float(bdtr(min(a_not_b, b_not_a), n, 0.5))) if n else 1.0
-
-
-def paired_t(differences: Floats) -> tuple[float, float]:
-    """t and the two-sided p-value of the paired t-test; 0 and 1 where there is no difference to test."""
-    from scipy.special import stdtr
-
-    n, mean = differences.size, float(differences.mean())
-    error = float(differences.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
-    if n < 2 or mean == 0:
-        return 0.0, 1.0
-    if error == 0:
-        return math.copysign(math.inf, mean), 0.0
-    t = mean / error
-    return t, 2 * float(stdtr(n - 1, -abs(t)))
-
-
-def _holm(p: list[float]) -> list[float]:
-    order = np.argsort(p, kind="stable")
-    factors = len(p) - np.arange(len(p))
-    adjusted = np.empty(len(p))
-    adjusted[order] = np.minimum(np.maximum.accumulate(np.asarray(p)[order] * factors), 1)
-    return adjusted.tolist()

@@ -20,7 +20,14 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from limsim_jax.metrics.blame import Responsibility
-from limsim_jax.metrics.intervals import RESAMPLES, Interval, wilson, zero_event_bound
+from limsim_jax.statistics import (
+    check_level,
+    mean_intervals,
+    median_interval,
+    poisson_rate,
+    wilson,
+    zero_event_bound,
+)
 
 if TYPE_CHECKING:
     from limsim_jax.sweep.store import Results
@@ -35,8 +42,6 @@ KEYS = ("scenario", "policy", "seed", "digest")
 
 CRASH_RATE = "crashes_per_1000_km"
 AT_FAULT_RATE = "at_fault_crashes_per_1000_km"
-
-_BLOCK = 2**20  # resampled weights at a time: bounds the memory
 
 # Shares that follow from metrics: an episode counts once, however many bodies it touched.
 _SHARES = {
@@ -183,8 +188,7 @@ def summary(results: Results, *, level: float = 0.95) -> pa.Table:
 
     Raises `ValueError` for no episodes or a level outside (0, 1).
     """
-    if not 0 < level < 1:
-        raise ValueError(f"the level must lie between 0 and 1, not {level!r}; 95 % is 0.95")
+    check_level(level)
     rows: list[dict[str, Any]] = []
     for (scenario, policy), part in groups(results).items():
         part, units = with_shares(part, results.units)
@@ -202,9 +206,9 @@ def summary(results: Results, *, level: float = 0.95) -> pa.Table:
                 found = wilson(int(x.sum()), x.size, level) if kind == "proportion" else intervals[k]
                 row |= dict(zip(("estimate", "lower", "upper"), found, strict=True))
                 row["bound"] = _bound(x, kind, level)
-                low, high = median_interval(x, level)
-                row |= dict(minimum=x.min(), median=np.median(x), maximum=x.max())
-                row |= dict(median_lower=low, median_upper=high)
+                row |= dict(minimum=x.min(), maximum=x.max())
+                names_of_median = ("median", "median_lower", "median_upper")
+                row |= dict(zip(names_of_median, median_interval(x, level), strict=True))
             rows.append(row)
         rows += [
             dict(scenario=scenario, policy=policy, **row) for row in _rates(part, level) if row is not None
@@ -244,95 +248,12 @@ def _rates(part: pa.Table, level: float) -> list[dict[str, Any]]:
         thousands = float(distance[measured].sum()) / 1e6
         if thousands > 0:
             count = int((events[measured] > 0).sum())
-            row |= dict(zip(("estimate", "lower", "upper"), poisson(count, thousands, level), strict=True))
+            row |= dict(
+                zip(("estimate", "lower", "upper"), poisson_rate(count, thousands, level), strict=True)
+            )
             row["bound"] = -math.log1p(-level) / thousands if count == 0 else None
         rows.append(row)
     return rows
-
-
-def poisson(events: int, exposure: float, level: float = 0.95) -> Interval:
-    """Events per unit of exposure, with the exact interval. Raises `ValueError` for no exposure."""
-    from scipy.special import gammaincinv
-
-    if events < 0 or not (exposure > 0 and math.isfinite(exposure)):
-        raise ValueError(f"{events} events in {exposure:g}? an exposure must be above 0")
-    tail = (1 - level) / 2
-    low = float(gammaincinv(events, tail)) if events else 0.0
-    return Interval(events / exposure, low / exposure, float(gammaincinv(events + 1, 1 - tail)) / exposure)
-
-
-def median_interval(values: Floats, level: float = 0.95) -> tuple[float, float]:
-    """Bounds of the median from order statistics; NaN where the values are too few for the level."""
-    from scipy.special import bdtr
-
-    x = np.sort(values)
-    n = x.size
-    # the most that may be cut at each end: P(Binomial(n, 1/2) < rank) <= (1 - level) / 2
-    ranks = np.arange(n // 2 + 1)
-    rank = int(np.sum(bdtr(ranks, n, 0.5) <= (1 - level) / 2))
-    if rank == 0:
-        return math.nan, math.nan
-    return float(x[rank - 1]), float(x[n - rank])
-
-
-def mean_intervals(
-    values: Floats, *, level: float = 0.95, resamples: int = RESAMPLES, seed: int = 0
-) -> list[Interval]:
-    """BCa bootstrap of the mean of each column of `[seeds, metrics]`; NaN is not measured.
-
-    Seeds are resampled, the same for all columns, so that a thousand columns cost little more than one.
-    As `metrics.intervals.bootstrap` otherwise: no width for equal values, no bounds (NaN) for a single
-    one, percentiles where no correction exists.
-    """
-    from scipy.special import ndtr, ndtri
-
-    m = values.shape[1]
-    there = ~np.isnan(values)
-    count = there.sum(0)
-    x = np.where(there, values, 0.0)
-    estimate = x.sum(0) / np.maximum(count, 1)
-    deviation = np.where(there, values - estimate, 0.0)
-    varied = (count > 1) & (np.where(there, values, -np.inf).max(0, initial=-np.inf)
-                            > np.where(there, values, np.inf).min(0, initial=np.inf))  # fmt: skip
-    some = np.flatnonzero(varied)
-    means = _resampled(deviation[:, some], there[:, some], resamples, seed)
-    z = float(ndtri((1 + level) / 2))
-    found = []
-    for k in range(m):
-        if count[k] < 2 or not varied[k]:
-            bounds = (estimate[k], estimate[k]) if count[k] > 1 else (math.nan, math.nan)
-            found.append(Interval(float(estimate[k]) if count[k] else math.nan, *map(float, bounds)))
-            continue
-        sample = means[:, np.searchsorted(some, k)]
-        sample = sample[~np.isnan(sample)]
-        shift = float(ndtri(((sample < 0).mean() + (sample <= 0).mean()) / 2))
-        u = deviation[:, k]
-        skew = float((u**3).sum() / (6 * (u**2).sum() ** 1.5))
-        ends = [ndtr(shift + (shift + q) / (1 - skew * (shift + q))) for q in (-z, z)]
-        if not np.isfinite(ends).all():
-            ends = [(1 - level) / 2, (1 + level) / 2]
-        low, high = estimate[k] + np.quantile(sample, ends)
-        found.append(Interval(float(estimate[k]), float(low), float(high)))
-    return found
-
-
-def _resampled(x: Floats, there: NDArray[np.bool_], resamples: int, seed: int) -> Floats:
-    """Means of each column, `[resamples, metrics]`: counts of the draws times values, a block at a time."""
-    n, m = x.shape
-    means = np.empty((resamples, m))
-    if not m:
-        return means
-    rng = np.random.default_rng(seed)
-    complete = there.all(0)
-    block = max(1, min(resamples, _BLOCK // n))
-    for first in range(0, resamples, block):
-        rows = min(block, resamples - first)
-        drawn = rng.integers(0, n, (rows, n), np.int32) + n * np.arange(rows, dtype=np.int32)[:, None]
-        weight = np.bincount(drawn.ravel(), minlength=rows * n).reshape(rows, n).astype(np.float64)
-        number = np.full((rows, m), float(n))
-        number[:, ~complete] = weight @ there[:, ~complete].astype(np.float64)
-        means[first : first + rows] = (weight @ x) / np.where(number > 0, number, np.nan)
-    return means
 
 
 class TextTable(NamedTuple):

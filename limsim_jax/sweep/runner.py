@@ -28,7 +28,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from limsim_jax.metrics.intervals import Interval, bootstrap, wilson
+from limsim_jax.statistics import Interval, bootstrap, wilson
 from limsim_jax.sweep.store import (
     NOT_COMPARED,
     DamagedError,

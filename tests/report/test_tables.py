@@ -8,9 +8,9 @@ import pytest
 from fake_results import NAN, ONE, UNITS, crashes, made
 from pyarrow.csv import read_csv
 
-from limsim_jax.metrics.intervals import bootstrap, wilson
 from limsim_jax.report import tables
-from limsim_jax.report.tables import headline, lookup, mean_intervals, summary, worst, write_csv
+from limsim_jax.report.tables import headline, lookup, summary, worst, write_csv
+from limsim_jax.statistics import bootstrap, wilson
 from limsim_jax.sweep.store import Results
 
 
@@ -36,28 +36,7 @@ def test_shares_have_wilsons_interval_and_means_the_bootstrap():
     )
 
 
-@pytest.mark.parametrize("level", [0.8, 0.99])
-def test_many_means_at_once_are_each_as_scipy_has_it(level):
-    """Columns that differ in scale, skew and in which seeds have a value."""
-    rng = np.random.default_rng(2)
-    values: Any = np.stack(
-        [rng.normal(1e4, 1, 80), -rng.exponential(1e-3, 80), rng.poisson(0.2, 80) * 1.0], -1
-    )
-    values[rng.random((80, 3)) < (0.0, 0.3, 0.1)] = NAN
-    for column, found in zip(values.T, mean_intervals(values, level=level, resamples=20_000), strict=True):
-        x = column[~np.isnan(column)]
-        expected = bootstrap(x, level=level, resamples=20_000)
-        width = expected.high - expected.low
-        assert found.estimate == pytest.approx(x.mean(), rel=1e-12)
-        assert [found.low, found.high] == pytest.approx(expected[1:], abs=0.04 * width)
-
-
-def test_means_of_equal_values_of_one_and_of_none():
-    values = np.array([[2.0, NAN, NAN, 1.0], [2.0, NAN, 5.0, 2.0], [2.0, NAN, NAN, 4.0]])
-    equal, none, one, _ = mean_intervals(values)
-    assert equal == (2.0, 2.0, 2.0)
-    assert np.isnan(none).all()
-    assert one.estimate == 5.0 and np.isnan(one[1:]).all()
+def test_means_of_one_value_and_of_none():
     rows = rows_of(made({ONE: {"mean_speed": [5.0, NAN], "min_ttc": [NAN, NAN]}}))
     assert (rows["mean_speed"]["estimate"], rows["mean_speed"]["lower"]) == (5.0, None)
     assert rows["min_ttc"]["estimate"] is None and rows["min_ttc"]["measured"] == 0
@@ -101,19 +80,6 @@ def test_crashes_per_distance_count_an_episode_once_and_have_the_exact_interval(
     row = rows_of(results)["crashes_per_1000_km"]
     assert (row["kind"], row["measured"], row["estimate"]) == ("rate", 5, 3.0)
     assert [row["lower"], row["upper"]] == pytest.approx([0.6187, 8.7673], abs=1e-4)
-    assert tables.poisson(0, 2.0).high == pytest.approx(3.6889 / 2, abs=1e-4)
-    assert tables.poisson(10, 1.0)[1:] == pytest.approx((4.7954, 18.3904), abs=1e-4)
-    with pytest.raises(ValueError, match="exposure"):
-        tables.poisson(1, 0.0)
-
-
-def test_medians_lie_between_order_statistics():
-    """Ranks 2 and 9 of 10, 40 and 61 of 100: the usual tables."""
-    rng = np.random.default_rng(3)
-    for n, ranks in ((10, (2, 9)), (100, (40, 61)), (6, (1, 6))):
-        x = rng.permutation(np.arange(1.0, n + 1))
-        assert tables.median_interval(x) == ranks
-    assert np.isnan(tables.median_interval(np.arange(5.0))).all()  # 5 values never reach 95 %
 
 
 def test_a_share_that_is_no_share_is_a_mean():

@@ -18,7 +18,7 @@ from fake_episodes import FakeEpisodes, both
 from paths import REPO
 
 from limsim_jax import files
-from limsim_jax.metrics.intervals import bootstrap, wilson
+from limsim_jax.statistics import bootstrap, wilson
 from limsim_jax.sweep import runner
 from limsim_jax.sweep.runner import Progress, run_here, sweep, verify
 from limsim_jax.sweep.store import Results, ResultsError, open_results

@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from limsim_jax.metrics.intervals import (
+from limsim_jax.statistics import (
     bootstrap,
-    clopper_pearson,
-    paired_difference,
+    holm,
+    mcnemar,
+    mean_intervals,
+    median_interval,
+    paired_t,
+    poisson_rate,
     wilson,
     zero_event_bound,
 )
@@ -36,27 +40,16 @@ def test_wilson_is_as_published(events, trials, low, high, digits):
     assert (round(found.low, digits), round(found.high, digits)) == (low, high)
 
 
-@pytest.mark.parametrize(
-    ("events", "trials", "low", "high"),
-    # Newcombe (1998), table I, method 5
-    [(81, 263, 0.2527, 0.3676), (15, 148, 0.0578, 0.1617), (0, 20, 0.0, 0.1684), (1, 29, 0.0009, 0.1776)],
-)
-def test_clopper_pearson_is_as_published(events, trials, low, high):
-    found = clopper_pearson(events, trials)
-    assert (round(found.low, 4), round(found.high, 4)) == (low, high)
-
-
 @pytest.mark.parametrize("level", [0.9, 0.95, 0.99])
 def test_intervals_of_shares_are_scipys(level):
     for trials in (1, 7, 200, 10_000):
         for events in {0, 1, trials // 3, trials - 1, trials}:
             result = stats.binomtest(events, trials)
-            for ours, method in ((wilson, "wilson"), (clopper_pearson, "exact")):
-                theirs = result.proportion_ci(level, method=method)
-                found = ours(events, trials, level)
-                assert found[0] == pytest.approx(events / trials)
-                assert found.low == pytest.approx(theirs.low, abs=1e-12)
-                assert found.high == pytest.approx(theirs.high, abs=1e-12)
+            theirs = result.proportion_ci(level, method="wilson")
+            found = wilson(events, trials, level)
+            assert found[0] == pytest.approx(events / trials)
+            assert found.low == pytest.approx(theirs.low, abs=1e-12)
+            assert found.high == pytest.approx(theirs.high, abs=1e-12)
 
 
 def test_no_event_in_many_trials():
@@ -72,13 +65,9 @@ def test_coverage_of_shares():
     n, shares = 40, np.linspace(0.02, 0.98, 25)
     k = np.arange(n + 1)
     mass = stats.binom.pmf(k[:, None], n, shares[None])
-    for method, least, most in ((wilson, 0.945, 0.96), (clopper_pearson, 0.955, 1.0)):
-        intervals = [method(int(i), n) for i in k]
-        inside = np.array([(i.low <= shares) & (shares <= i.high) for i in intervals])
-        coverage = (mass * inside).sum(0)
-        assert least < coverage.mean() < most
-        if method is clopper_pearson:
-            assert coverage.min() >= 0.95
+    intervals = [wilson(int(i), n) for i in k]
+    inside = np.array([(i.low <= shares) & (shares <= i.high) for i in intervals])
+    assert 0.945 < (mass * inside).sum(0).mean() < 0.96
 
 
 def skewed(n, seed):
@@ -129,13 +118,65 @@ def test_pairs_take_out_what_seeds_share():
     rng = np.random.default_rng(0)
     easy = rng.normal(size=300) * 10  # how hard each seed is
     a, b = easy + 0.5 + rng.normal(size=300) * 0.3, easy + rng.normal(size=300) * 0.3
-    found = paired_difference(a, b, resamples=2000)
+    found = bootstrap(a - b, resamples=2000)
     assert found.estimate == pytest.approx(np.mean(a - b))
     assert found.low > 0.4 and found.high < 0.6
     t = stats.ttest_rel(a, b).confidence_interval()
     assert found.low == pytest.approx(t.low, abs=0.01) and found.high == pytest.approx(t.high, abs=0.01)
-    back = paired_difference(b, a, resamples=2000)
+    back = bootstrap(b - a, resamples=2000)
     assert back.estimate == pytest.approx(-found.estimate)
+
+
+def test_rates_have_garwoods_interval():
+    assert poisson_rate(3, 1.0)[1:] == pytest.approx((0.6187, 8.7673), abs=1e-4)
+    assert poisson_rate(0, 2.0).high == pytest.approx(3.6889 / 2, abs=1e-4)
+    assert poisson_rate(10, 1.0)[1:] == pytest.approx((4.7954, 18.3904), abs=1e-4)
+
+
+def test_medians_lie_between_order_statistics():
+    """Ranks 2 and 9 of 10, 40 and 61 of 100: the usual"""
+    rng = np.random.default_rng(3)
+    for n, ranks in ((10, (2, 9)), (100, (40, 61)), (6, (1, 6))):
+        x = rng.permutation(np.arange(1.0, n + 1))
+        assert median_interval(x) == (np.median(x), *ranks)
+    assert np.isnan(median_interval(np.arange(5.0))[1:]).all()  # 5 values never reach 95 %
+
+
+@pytest.mark.parametrize("level", [0.8, 0.99])
+def test_many_means_at_once_are_each_as_scipy_has_it(level):
+    """Columns that differ in scale, skew and in which seeds have a value."""
+    rng = np.random.default_rng(2)
+    values: Any = np.stack(
+        [rng.normal(1e4, 1, 80), -rng.exponential(1e-3, 80), rng.poisson(0.2, 80) * 1.0], -1
+    )
+    values[rng.random((80, 3)) < (0.0, 0.3, 0.1)] = math.nan
+    for column, found in zip(values.T, mean_intervals(values, level=level, resamples=20_000), strict=True):
+        x = column[~np.isnan(column)]
+        expected = bootstrap(x, level=level, resamples=20_000)
+        width = expected.high - expected.low
+        assert found.estimate == pytest.approx(x.mean(), rel=1e-12)
+        assert [found.low, found.high] == pytest.approx(expected[1:], abs=0.04 * width)
+
+
+def test_many_means_of_equal_values_of_one_and_of_none():
+    nan = math.nan
+    values = np.array([[2.0, nan, nan, 1.0], [2.0, nan, 5.0, 2.0], [2.0, nan, nan, 4.0]])
+    equal, none, one, _ = mean_intervals(values)
+    assert equal == (2.0, 2.0, 2.0)
+    assert np.isnan(none).all()
+    assert one.estimate == 5.0 and np.isnan(one[1:]).all()
+
+
+def test_p_values():
+    assert mcnemar(5, 0) == 0.0625
+    assert mcnemar(1, 9) == mcnemar(9, 1) == pytest.approx(22 / 1024)
+    assert mcnemar(0, 0) == mcnemar(4, 4) == 1.0
+    assert paired_t(np.array([1.0, 2.0, 3.0]))[1] == pytest.approx(0.0741799, abs=1e-6)
+    assert paired_t(np.zeros(5)) == (0.0, 1.0)
+    assert paired_t(np.full(5, -2.0)) == (-np.inf, 0.0)
+    assert paired_t(np.array([3.0])) == (0.0, 1.0)
+    # Holm's own steps: 4 p1, 3 p2, 2 p3, p4, never falling
+    assert holm([0.02, 0.005, 0.9, 0.021]) == pytest.approx([0.06, 0.02, 0.9, 0.06])
 
 
 @pytest.mark.parametrize(
@@ -143,14 +184,15 @@ def test_pairs_take_out_what_seeds_share():
     [
         (lambda: wilson(3, 2), r"3 events in 2 trials: need 0 <= events <= trials and trials >= 1"),
         (lambda: wilson(0, 0), r"0 events in 0 trials"),
-        (lambda: clopper_pearson(-1, 5), r"-1 events in 5 trials"),
+        (lambda: wilson(-1, 5), r"-1 events in 5 trials"),
         (lambda: wilson(cast(Any, 0.5), 2), r"events must be a whole number, not 0.5"),
         (lambda: wilson(1, 2, 1.5), r"the level must lie between 0 and 1, not 1.5"),
         (lambda: wilson(1, 2, 95), r"the level must lie between 0 and 1, not 95; 95 % is 0.95"),
         (lambda: zero_event_bound(0), r"0 events in 0 trials"),
+        (lambda: poisson_rate(1, 0.0), r"1 events in 0: the exposure must be above 0"),
+        (lambda: median_interval([]), r"it has shape \(0,\)"),
         (lambda: bootstrap([]), r"values must be a list of numbers, one per seed; it has shape \(0,\)"),
         (lambda: bootstrap([1.0, math.nan]), r"1 of 2 values are not finite; leave them out"),
-        (lambda: paired_difference([1.0, 2.0], [1.0]), r"2 values but 1 others; pairs need the same seeds"),
     ],
 )
 def test_wrong_input_is_named(call, message):
