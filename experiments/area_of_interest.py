@@ -24,7 +24,7 @@ from limsim_jax.bench import _processor
 from limsim_jax.files import write_whole
 from limsim_jax.statistics import bootstrap
 from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import Experiment, read_experiments
+from limsim_jax.sweep.experiment import ExperimentFile, read_experiments
 from limsim_jax.xla import enable_compilation_cache, use_all_cores
 
 RESULTS = Path(__file__).parent / "results"
@@ -38,14 +38,14 @@ AREAS = ((2, 15.0), (4, 25.0), (8, 50.0), (16, 50.0), (SLOTS, EVERYWHERE))
 """Vehicles planned for beside the ego, and the radius in m within which."""
 
 
-def with_area(experiment: Experiment, slots: int, radius: float) -> Experiment:
+def with_area(experiment: ExperimentFile, slots: int, radius: float) -> ExperimentFile:
     """The experiment with LimSim-TM at so many wheels beside the ego's."""
     options = {"around": "limsim_tm", "slots": slots, "radius": radius}
     ego = experiment.ego.model_copy(update={"options": options})
     return experiment.model_copy(update={"ego": ego, "slots": SLOTS})
 
 
-def outcomes(experiment: Experiment, seeds: range, chunk: int) -> tuple[dict[str, np.ndarray], float]:
+def outcomes(experiment: ExperimentFile, seeds: range, chunk: int) -> tuple[dict[str, np.ndarray], float]:
     """Metrics of each seed, and s of CPU time per world."""
     episodes = Episodes(experiment, chunk=chunk)
     episodes.compile()

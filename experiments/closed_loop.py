@@ -27,7 +27,7 @@ from limsim_jax.calibration.matching import Engine, TrafficFlow, match
 from limsim_jax.calibration.recordings import read_recording
 from limsim_jax.calibration.report import gather
 from limsim_jax.files import write_whole
-from limsim_jax.maps import build_lane_map, bundled_maps, load_map
+from limsim_jax.maps import build_lane_map, bundled_maps, read_network
 from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.simulation.rollout import Rollout
@@ -82,7 +82,7 @@ def recordings(folder: Path, name: str) -> dict[str, Any]:
 
 def saturation_engine() -> Engine:
     """Cars straight on over the bundled crossing, more than the lights let through: queues never end."""
-    network = load_map(bundled_maps()["intersection"])
+    network = read_network(bundled_maps()["intersection"])
     goals = default_goals(network)
     lane_map = build_lane_map(network, goals)
     rows = lane_rows(network)
@@ -100,7 +100,7 @@ def saturation_engine() -> Engine:
 
 def lane_change_engine(density: float) -> Engine:
     """Cars on the bundled motorway, as dense as recorded; how fast they are follows from that."""
-    network = load_map(bundled_maps()["highway"])
+    network = read_network(bundled_maps()["highway"])
     goals = default_goals(network)
     lane_map = build_lane_map(network, goals)
     demand = build_demand(

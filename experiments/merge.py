@@ -23,7 +23,7 @@ import numpy as np
 from soundness import STANDS, Changes
 
 from limsim_jax.files import write_whole
-from limsim_jax.maps import build_lane_map, load_map
+from limsim_jax.maps import build_lane_map, read_network
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.worlds import Worlds
@@ -87,7 +87,7 @@ def flows(case: str, motorway: float, ramp: float) -> list[tuple[str, str, float
 
 def ours(net: Path, demand: list[tuple[str, str, float]], worlds: int) -> dict[str, Any]:
     """Our traffic."""
-    found = load_map(net)
+    found = read_network(net)
     lane_map = build_lane_map(found)
     wanted = [Flow(origin=a, goal=b, rate=rate) for a, b, rate in demand if rate > 0]
     population = fitting(default_population(), lane_map)

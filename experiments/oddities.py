@@ -22,7 +22,7 @@ from soundness import HORIZON, INITIAL, OTHER_RATE, RATES, RESULTS, SLOTS, check
 
 from limsim_jax.bench import build_traffic
 from limsim_jax.files import write_whole
-from limsim_jax.maps import build_lane_map, bundled_maps, load_map
+from limsim_jax.maps import build_lane_map, bundled_maps, read_network
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.simulation.rollout import Rollout, one_world
 from limsim_jax.traffic.demand import sample_scenario
@@ -86,7 +86,7 @@ def odd(lane_map: LaneMap, seen: Seen) -> dict[str, Bool[np.ndarray, "T N"]]:
 
 def watch(name: str, worlds: int) -> dict[str, Any]:
     """Watch some worlds on a map."""
-    network = load_map(bundled_maps().get(name) or name)
+    network = read_network(bundled_maps().get(name) or name)
     lane_map = build_lane_map(network)
     lanes = list(lane_rows(network))
     demand, _ = build_traffic(

@@ -22,7 +22,7 @@ import numpy as np
 
 from limsim_jax.bench import build_traffic
 from limsim_jax.files import write_whole
-from limsim_jax.maps import build_lane_map, bundled_maps, load_map
+from limsim_jax.maps import build_lane_map, bundled_maps, read_network
 from limsim_jax.maps.conflicts import ConflictTable, ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.maps.signals import SignalState, lane_states
@@ -157,7 +157,7 @@ def episodes(
     path: str | Path, rate: float, count: int, *, slots: int, chunk: int, initial: int = INITIAL
 ) -> dict[str, Any]:
     """Run `count` episodes on a map and add up what happened."""
-    network = load_map(path)
+    network = read_network(path)
     lane_map = build_lane_map(network)
     demand, _ = build_traffic(network, lane_map, rate=rate, vehicles=initial, seconds=HORIZON)
     run = Rollout(Config(dt=0.1), Traffic(), HORIZON, measure=Watch(lane_map.conflicts))

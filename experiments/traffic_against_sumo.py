@@ -31,7 +31,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from numpy.typing import NDArray
 
-from limsim_jax.maps import build_lane_map, load_map
+from limsim_jax.maps import build_lane_map, read_network
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.sumo_demand import read_demand
@@ -134,7 +134,7 @@ def drive_ours(net: Path, vehicles: Platoon, seconds: float) -> Ride:
     # decisions every 0.5 s, and actuators without delay
     limits = Limits(acceleration=20.0, deceleration=20.0, jerk=1e6, acceleration_lag=0.0)
     traffic = Traffic(model=IDM(), limits=limits)
-    lane_map = build_lane_map(load_map(net, cache=False), cache=False)
+    lane_map = build_lane_map(read_network(net, cache=False), cache=False)
     n = len(vehicles.s)
     given = {field.name: 0.0 for field in fields(Driver)} | {
         "v_max": 60.0,
@@ -631,7 +631,7 @@ def prepare(
     """Network file, network and our scenarios, one per seed."""
     case, folder = CASES[name], SHARED / name
     net = merged_net(next(folder.glob("*.net.xml")), folder / case.programs if case.programs else None, out)
-    network = load_map(net)
+    network = read_network(net)
     demand = read_demand([folder / file for file in case.files], network)
     vehicles = list(demand.vehicles.items())
     demand = replace(demand, vehicles=dict(vehicles[:: case.every]))

@@ -234,7 +234,7 @@ def markdown(result: dict[str, Any]) -> str:
         "|---|---:|---:|",
     ]
     stages = {
-        "read_s": "read the file: `load_map`",
+        "read_s": "read the file: `read_network`",
         "build_s": "rasterise, with all tables: `build_lane_map`",
         "total_s": "**both**",
         "import_s": "imports and start of JAX, before that",
@@ -347,7 +347,7 @@ def _load(path: str, *, cache: bool) -> tuple[dict[str, Any], Any, Any]:
 
     jax.devices()
     imported = time.perf_counter()
-    network = maps.load_map(path, cache=cache)
+    network = maps.read_network(path, cache=cache)
     read = time.perf_counter()
     lanes = jax.block_until_ready(maps.build_lane_map(network, cache=cache))
     built = time.perf_counter()
@@ -426,7 +426,7 @@ def _traffic(path: str, told: str) -> dict[str, Any]:
     import jax
     import numpy as np
 
-    from limsim_jax.maps import build_lane_map, load_map
+    from limsim_jax.maps import build_lane_map, read_network
     from limsim_jax.simulation.rollout import Rollout
     from limsim_jax.simulation.worlds import Worlds
     from limsim_jax.traffic.demand import sample_scenario
@@ -441,7 +441,7 @@ def _traffic(path: str, told: str) -> dict[str, Any]:
     jax.monitoring.register_event_listener(
         lambda event, **_: hits.append(event) if event == "/jax/compilation_cache/cache_hits" else None
     )
-    network = load_map(path)
+    network = read_network(path)
     lane_map = build_lane_map(network)
     demand = _full(network, lane_map, options["rate"], slots, seconds)
     run = Rollout(Config(dt=DT), Traffic(), seconds)

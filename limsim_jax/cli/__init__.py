@@ -490,9 +490,9 @@ def _path(file: str) -> Path:
 
 
 def _load(file: str, no_cache: bool) -> Network:
-    from limsim_jax.maps import load_map
+    from limsim_jax.maps import read_network
 
-    return load_map(_path(file), cache=not no_cache)
+    return read_network(_path(file), cache=not no_cache)
 
 
 def _facts(network: Network) -> dict[str, Any]:

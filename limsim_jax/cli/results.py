@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from limsim_jax.report.tables import TextTable
     from limsim_jax.sweep.episode import Episodes
-    from limsim_jax.sweep.experiment import Experiment
     from limsim_jax.sweep.runner import Progress
     from limsim_jax.sweep.store import Results
 
@@ -264,7 +263,7 @@ def replay(
 
 
 def build(
-    experiments: Sequence[Experiment], chunk: int | None = None, cores: int | None = None
+    experiments: Sequence[ExperimentFile], chunk: int | None = None, cores: int | None = None
 ) -> list[Episodes]:
     """Episodes of experiments, on all cores or so many."""
     from limsim_jax.sweep.episode import Episodes
@@ -277,10 +276,10 @@ def build(
 
 def _rebuild(results: Results, scenario: str, policy: str) -> Episodes:
     """Episodes as they were when the results were made."""
-    from limsim_jax.sweep.experiment import Experiment
+    from limsim_jax.sweep.experiment import ExperimentFile
 
     stored = results.provenance[scenario, policy]
-    experiment = Experiment.model_validate(stored["experiment"] | {"map": stored["map_file"]})
+    experiment = ExperimentFile.model_validate(stored["experiment"] | {"map": stored["map_file"]})
     (episodes,) = build([experiment], stored["chunk"])
     return episodes
 

@@ -21,7 +21,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 _loaded: weakref.WeakKeyDictionary[Network, tuple[str, ...]] = weakref.WeakKeyDictionary()
 
 
-def load_map(path: str | Path, *, cache: bool = True) -> Network:
+def read_network(path: str | Path, *, cache: bool = True) -> Network:
     """Read a road network from an OpenDRIVE (`.xodr`) or SUMO (`.net.xml`) file, also gzipped.
 
     The root element decides which of the two it is. With `cache` the result is kept on disk
@@ -59,7 +59,7 @@ def build_lane_map(
 ) -> LaneMap:
     """Turn a network into device arrays: see `limsim_jax.maps.lane_map.build_lane_map`.
 
-    With `cache` the arrays of a network that comes straight from `load_map` are kept on disk.
+    With `cache` the arrays of a network that comes straight from `read_network` are kept on disk.
     """
     import jax
     import numpy as np

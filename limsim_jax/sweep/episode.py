@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import limsim_jax
-from limsim_jax.maps import build_lane_map, bundled_maps, load_map
+from limsim_jax.maps import build_lane_map, bundled_maps, read_network
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import MapError, Network
 from limsim_jax.maps.origins import origins
@@ -38,7 +38,7 @@ from limsim_jax.simulation.rollout import Carry, Result, Rollout, Started, start
 from limsim_jax.simulation.totals import Totals
 from limsim_jax.simulation.trace import Trace, trace
 from limsim_jax.simulation.worlds import Worlds
-from limsim_jax.sweep.experiment import Bounds, EgoTable, Experiment, ExperimentError
+from limsim_jax.sweep.experiment import Bounds, EgoTable, ExperimentError, ExperimentFile
 from limsim_jax.sweep.store import Outcome
 from limsim_jax.traffic import car_following
 from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand, sample_scenario
@@ -116,7 +116,7 @@ class Episodes:
       ExperimentError: the experiment does not fit its map or names what is not there; one line.
     """
 
-    def __init__(self, experiment: Experiment, *, chunk: int | None = None) -> None:
+    def __init__(self, experiment: ExperimentFile, *, chunk: int | None = None) -> None:
         self.experiment = experiment
         self.scenario, self.policy = experiment.name, experiment.policy
         self.units = UNITS
@@ -349,7 +349,7 @@ def _source_hash() -> str:
 # --- from the words of the file to arrays ------------------------------------------------------------
 
 
-def _policy(experiment: Experiment) -> Policy:
+def _policy(experiment: ExperimentFile) -> Policy:
     name, options = experiment.ego.policy, experiment.ego.options
     where = f"{experiment.name}: ego.policy"
     if ":" in name:
@@ -373,10 +373,10 @@ def _policy(experiment: Experiment) -> Policy:
     return policy
 
 
-def _map(experiment: Experiment) -> tuple[Network, LaneMap, dict[str, tuple[str, ...]]]:
+def _map(experiment: ExperimentFile) -> tuple[Network, LaneMap, dict[str, tuple[str, ...]]]:
     path = bundled_maps().get(experiment.map, experiment.map)
     try:
-        network = load_map(path)
+        network = read_network(path)
     except MapError as error:
         known = ", ".join(bundled_maps())
         hint = "" if os.path.exists(path) else f"; bundled maps are {known}"
@@ -394,7 +394,7 @@ def _map(experiment: Experiment) -> tuple[Network, LaneMap, dict[str, tuple[str,
 
 
 def _ego(
-    experiment: Experiment,
+    experiment: ExperimentFile,
     network: Network,
     lane_map: LaneMap,
     goals: Mapping[str, tuple[str, ...]],
@@ -469,7 +469,7 @@ def _start_lane(name: str, ego: EgoTable, network: Network) -> str:
 
 
 def _demand(
-    experiment: Experiment,
+    experiment: ExperimentFile,
     network: Network,
     lane_map: LaneMap,
     goals: Mapping[str, tuple[str, ...]],

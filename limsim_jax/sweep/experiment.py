@@ -1,6 +1,6 @@
 """Experiment files: which traffic, which ego, which policy, for how long.
 
-A TOML file describes one `Experiment`, or names others: `experiments = ["highway.toml", "ramp.toml"]`.
+A TOML file describes one `ExperimentFile`, or names others: `experiments = ["highway.toml", "ramp.toml"]`.
 Whatever is wrong is one line that names the file and the field.
 """
 
@@ -113,7 +113,7 @@ class Bounds(_Table):
     max: float | None = None
 
 
-class Experiment(_Table):
+class ExperimentFile(_Table):
     """One experiment. `Field`s have the units that their descriptions say."""
 
     name: Name
@@ -149,7 +149,7 @@ def bundled_experiments() -> dict[str, Path]:
 
 def read_experiments(
     path: str | Path, *, map_file: str | None = None, policy: str | None = None
-) -> list[Experiment]:
+) -> list[ExperimentFile]:
     """Read an experiment file, or the name of a bundled one.
 
     Args:
@@ -195,7 +195,9 @@ def read_experiments(
     return [_experiment(found, path, map_file, policy)]
 
 
-def _experiment(found: Mapping[str, Any], path: Path, map_file: str | None, policy: str | None) -> Experiment:
+def _experiment(
+    found: Mapping[str, Any], path: Path, map_file: str | None, policy: str | None
+) -> ExperimentFile:
     found = {"name": path.stem, **found}
     if map_file is not None:
         found["map"] = map_file
@@ -212,7 +214,7 @@ def _experiment(found: Mapping[str, Any], path: Path, map_file: str | None, poli
             ego.pop("options", None)  # they are those of the other one
         found["ego"] = ego | {"policy": policy}
     try:
-        return Experiment.model_validate(found)
+        return ExperimentFile.model_validate(found)
     except ValidationError as error:
         raise ExperimentError(f"{path}: {_first(error)}") from None
 
@@ -242,7 +244,7 @@ def _is_branch(part: Any) -> bool:
 
 def _fields_at(where: tuple[Any, ...]) -> list[str]:
     tables: dict[tuple[str, ...], type[BaseModel]] = {
-        (): Experiment,
+        (): ExperimentFile,
         ("ego",): EgoTable,
         ("traffic",): TrafficTable,
         ("traffic", "flow"): Flow,

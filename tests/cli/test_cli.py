@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 import limsim_jax as lj
 from limsim_jax import cli
+from limsim_jax.maps import bundled_map, bundled_maps, read_network
 
 LANES = """
 <lanes><laneSection s="0"><center><lane id="0" type="none"/></center><right>
@@ -74,10 +75,10 @@ def test_help_names_every_command():
     assert "maps" in result.output and "traffic" in result.output
 
 
-@pytest.mark.parametrize("name", sorted(lj.bundled_maps()))
+@pytest.mark.parametrize("name", sorted(bundled_maps()))
 def test_info_on_bundled_maps(name, run, tmp_path):
     code, out, err = run("map", "info", name, "--json", tmp_path / "info.json")
-    network = lj.load_map(lj.bundled_map(name))
+    network = read_network(bundled_map(name))
     assert (code, err) == (0, "")
     facts = json.loads((tmp_path / "info.json").read_text())
     assert facts["lanes"] == len(network.lanes)
@@ -251,7 +252,7 @@ def test_user_errors_are_one_line(case, run, tmp_path, monkeypatch):
 def test_load_map_refuses_with_one_line(content, tmp_path):
     (tmp_path / "map.xodr").write_bytes(content)
     with pytest.raises(lj.MapError) as caught:
-        lj.load_map(tmp_path / "map.xodr")
+        read_network(tmp_path / "map.xodr")
     assert "\n" not in str(caught.value) and "map.xodr" in str(caught.value)
 
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from limsim_jax import bench, bundled_map, cli, load_map
+from limsim_jax import bench, bundled_map, cli, read_network
 from limsim_jax.cli import trace as trace_file
 from limsim_jax.maps import build_lane_map
 from limsim_jax.types import Status
@@ -49,7 +49,7 @@ def test_it_runs_and_writes(ran):
     for file in ran.files.values():
         assert (ran.folder / file).stat().st_size > 0
     assert ran.summary["initial"] == START and ran.summary["seconds"] == SECONDS
-    assert ran.summary["file_hash"] == load_map(bundled_map("roundabout")).file_hash
+    assert ran.summary["file_hash"] == read_network(bundled_map("roundabout")).file_hash
     assert ran.trace["time"].shape == (30,)
     np.testing.assert_allclose(ran.trace["time"], 0.1 * np.arange(1, 31), atol=1e-5)
 
@@ -72,7 +72,7 @@ def test_summary_agrees_with_trace(ran):
 
 def test_positions_are_those_of_the_map_file(ran):
     """The centre of a body lies half a length behind its front bumper, on its lane as the file has it."""
-    network, trace = load_map(bundled_map("roundabout")), ran.trace
+    network, trace = read_network(bundled_map("roundabout")), ran.trace
     checked = 0
     for k, slot in np.argwhere(trace["active"]):
         s = float(trace["s"][k, slot] - trace["length"][k, slot] / 2)
@@ -106,7 +106,7 @@ def test_missing_pyarrow_is_told(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.parametrize("vehicles", [0, 7, 30])
 def test_traffic_starts_with_the_vehicles_asked_for(vehicles):
-    network = load_map(bundled_map("roundabout"))
+    network = read_network(bundled_map("roundabout"))
     demand, origins = bench.build_traffic(
         network, build_lane_map(network), rate=100.0, vehicles=vehicles, seconds=5.0
     )

@@ -8,7 +8,7 @@ import textwrap
 
 from paths import REPO
 
-import limsim_jax as lj
+from limsim_jax.maps import bundled_maps
 from limsim_jax.policies import host
 
 README = (REPO / "README.md").read_text()
@@ -37,7 +37,7 @@ def test_figures_are_those_measured():
 
 
 def test_bundled_maps_are_listed():
-    for name in lj.bundled_maps():
+    for name in bundled_maps():
         assert f"`{name}`" in README
 
 

@@ -11,10 +11,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
-import limsim_jax as lj
 from limsim_jax import maps
 from limsim_jax.files import cache_directory
-from limsim_jax.maps import cache
+from limsim_jax.maps import build_lane_map, bundled_map, cache, read_network
 from limsim_jax.maps.network import ImportReport, Lane, Network
 
 
@@ -44,7 +43,7 @@ def reads(monkeypatch):
 @pytest.fixture
 def file(tmp_path):
     file = tmp_path / "town.xodr"
-    file.write_bytes(lj.bundled_map("intersection").read_bytes())
+    file.write_bytes(bundled_map("intersection").read_bytes())
     return file
 
 
@@ -70,7 +69,7 @@ def pickle_free(value):
 
 
 def test_second_load_is_a_hit_and_equal(file, reads, folder):
-    first, second = lj.load_map(file), lj.load_map(file)
+    first, second = read_network(file), read_network(file)
     assert reads == [file]
     assert first is not second
     assert_same(first, second)
@@ -78,24 +77,24 @@ def test_second_load_is_a_hit_and_equal(file, reads, folder):
 
 
 def test_changed_byte_is_a_miss(file, reads):
-    lj.load_map(file)
+    read_network(file)
     file.write_bytes(file.read_bytes() + b"\n")
-    lj.load_map(file)
+    read_network(file)
     assert reads == [file, file]
 
 
 def test_changed_source_code_is_a_miss(file, reads, monkeypatch):
-    lj.load_map(file)
+    read_network(file)
     monkeypatch.setattr(cache, "_fingerprint", lambda: b"another version")
-    lj.load_map(file)
+    read_network(file)
     assert reads == [file, file]
 
 
 def test_moved_file_names_its_new_place(file, reads, tmp_path):
-    lj.load_map(file)
+    read_network(file)
     (tmp_path / "elsewhere").mkdir()
     moved = file.rename(tmp_path / "elsewhere" / file.name)
-    assert lj.load_map(moved).source == str(moved)
+    assert read_network(moved).source == str(moved)
     assert reads == [file]
 
 
@@ -116,7 +115,7 @@ def test_gzipped_map_is_the_same_map(form, file, tmp_path, reads, folder):
     packed = tmp_path / "packed" / file.name
     packed.parent.mkdir()
     packed.write_bytes(gzip.compress(content))
-    plain, unpacked = lj.load_map(file), lj.load_map(packed)
+    plain, unpacked = read_network(file), read_network(packed)
     assert reads == [file]
     assert plain.file_hash == unpacked.file_hash
     assert list(plain.lanes) == list(unpacked.lanes)
@@ -124,8 +123,8 @@ def test_gzipped_map_is_the_same_map(form, file, tmp_path, reads, folder):
 
 
 def test_without_cache_leaves_no_trace(file, reads, folder):
-    lj.build_lane_map(lj.load_map(file, cache=False), cache=False)
-    lj.load_map(file, cache=False)
+    build_lane_map(read_network(file, cache=False), cache=False)
+    read_network(file, cache=False)
     assert reads == [file, file]
     assert not folder.exists()
 
@@ -143,12 +142,12 @@ def test_without_cache_leaves_no_trace(file, reads, folder):
     ids=["empty", "header cut", "end cut", "bit flipped", "longer", "other file"],
 )
 def test_damaged_entry_is_named_and_built_anew(damage, file, reads, folder, caplog):
-    first = lj.load_map(file)
+    first = read_network(file)
     (entry,) = folder.iterdir()
     good = entry.read_bytes()
     entry.write_bytes(damage(good))
     with caplog.at_level(logging.WARNING, "limsim_jax"):
-        second = lj.load_map(file)
+        second = read_network(file)
     assert str(entry) in caplog.text and "damaged" in caplog.text
     assert reads == [file, file]
     assert_same(first, second)
@@ -192,13 +191,13 @@ def test_values_come_back_as_they_are():
 
 def _compete(path, barrier, results):
     barrier.wait()
-    network = lj.load_map(path)
+    network = read_network(path)
     results.put(len(network.lanes))
 
 
 def test_competing_writers(file, folder):
     """Many processes that load the same new map at once all get it, and one whole entry remains."""
-    lanes = len(lj.load_map(file, cache=False).lanes)
+    lanes = len(read_network(file, cache=False).lanes)
     context = multiprocessing.get_context("spawn")
     barrier, results = context.Barrier(4), context.Queue()
     workers = [context.Process(target=_compete, args=(file, barrier, results)) for _ in range(4)]
@@ -219,7 +218,7 @@ def test_unwritable_folder_is_said_once(obstacle, file, tmp_path, monkeypatch, c
     place = tmp_path / "taken" if obstacle == "a file" else tmp_path / "taken" / "cache"
     monkeypatch.setenv("LIMSIM_JAX_CACHE", str(place))
     with caplog.at_level(logging.WARNING, "limsim_jax"):
-        first, second = lj.load_map(file), lj.load_map(file)
+        first, second = read_network(file), read_network(file)
     assert_same(first, second)
     assert len(caplog.records) == 1 and "not kept" in caplog.text
 
@@ -232,7 +231,7 @@ def test_file_that_changes_while_it_is_read_is_not_kept(file, folder, monkeypatc
         return read(path, root)
 
     monkeypatch.setattr(maps, "_read", changed)
-    lj.load_map(file)
+    read_network(file)
     assert not folder.exists()
 
 
@@ -283,12 +282,12 @@ def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
         return build(network, goals, report=report)
 
     monkeypatch.setattr(lane_map, "build_lane_map", counted)
-    network = lj.load_map(file)
+    network = read_network(file)
     goals = default_goals(network)
     assert len(goals) >= 2
     first, second = ImportReport(), ImportReport()
-    built = lj.build_lane_map(network, report=first)
-    kept = lj.build_lane_map(lj.load_map(file), report=second)
+    built = build_lane_map(network, report=first)
+    kept = build_lane_map(read_network(file), report=second)
     assert calls == [None]
     assert first == second and "somewhere" in str(second.notes)
     assert jax.tree.structure(built) == jax.tree.structure(kept)
@@ -297,8 +296,8 @@ def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
         np.testing.assert_array_equal(a, b)
     groups = [list(group) for group in goals.values()]
     for same in (goals, groups, goals):
-        lj.build_lane_map(network, same)
-    lj.build_lane_map(network, groups[::-1])
+        build_lane_map(network, same)
+    build_lane_map(network, groups[::-1])
     assert calls == [None, goals, groups[::-1]]
 
 
@@ -306,13 +305,13 @@ def test_network_that_was_changed_is_not_taken_from_the_cache(file, folder):
     """Its file hash is that of the file, but its lanes are not."""
     import dataclasses
 
-    network = lj.load_map(file)
-    lj.build_lane_map(network)
+    network = read_network(file)
+    build_lane_map(network)
     slow = dataclasses.replace(
         network,
         lanes={name: dataclasses.replace(lane, speed_limit=1.0) for name, lane in network.lanes.items()},
     )
     before = entries(folder)
-    assert float(lj.build_lane_map(slow).speed_limit[0]) == 1.0
-    assert float(lj.build_lane_map(network).speed_limit[0]) != 1.0
+    assert float(build_lane_map(slow).speed_limit[0]) == 1.0
+    assert float(build_lane_map(network).speed_limit[0]) != 1.0
     assert entries(folder) == before

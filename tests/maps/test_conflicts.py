@@ -22,7 +22,7 @@ from synthetic import (
     straight,
 )
 
-from limsim_jax.maps import load_map
+from limsim_jax.maps import read_network
 from limsim_jax.maps.conflicts import (
     ABSENT,
     MARGIN,
@@ -614,7 +614,7 @@ def test_conflicts_are_the_foes_of_sumo(path):
     different roads, which overlap for less than 3 m. Lanes of one road that it draws closer together than
     vehicles are wide are no foes to it.
     """
-    net = load_map(path)
+    net = read_network(path)
     drivable = rows(net)
     known = [m for m in net.movements if m.via and {m.incoming, m.outgoing, *m.via} <= drivable.keys()]
     through = {}
@@ -654,7 +654,7 @@ def test_conflicts_are_the_foes_of_sumo(path):
     ids=lambda path: f"{path.parent.name}-{path.stem}",
 )
 def test_tables_of_real_maps_hold_together(path):
-    net = load_map(path)
+    net = read_network(path)
     table = build_conflicts(net, rows(net))
     real = table.foe >= 0
     length = np.repeat(table.length[:, None], table.foe.shape[1], 1)

@@ -10,7 +10,7 @@ import pytest
 from paths import SHARED, needs_shared
 from synthetic import intersection, network, rows, shuffled, straight
 
-from limsim_jax.maps import load_map
+from limsim_jax.maps import read_network
 from limsim_jax.maps.network import MapError
 from limsim_jax.maps.routing import (
     FAR,
@@ -413,7 +413,7 @@ def test_distances_are_those_of_sumos_router(name):
 
     path = SHARED / "sumo" / f"{name}.net.xml"
     theirs = sumolib.net.readNet(str(path), withInternal=True)
-    net = load_map(path)
+    net = read_network(path)
     # The same lengths as sumolib: that of the edge, which is declared in the file, for all its lanes.
     lanes = {
         lane.id: dataclasses.replace(
@@ -443,7 +443,7 @@ def test_distances_are_those_of_sumos_router(name):
 @needs_shared
 @pytest.mark.parametrize("name", ["limsim_town05/Town05", "bologna_pasubio/pasubio_buslanes"])
 def test_every_exit_of_a_town_can_be_reached(name):
-    net = load_map(SHARED / "sumo" / f"{name}.net.xml")
+    net = read_network(SHARED / "sumo" / f"{name}.net.xml")
     goals = default_goals(net)
     table = build_routes(net, rows(net), goals)
     assert table.reachable[:-1].any(0).all()

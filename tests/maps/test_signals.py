@@ -14,7 +14,7 @@ import pytest
 from paths import SHARED, needs_shared
 from synthetic import intersection, mirrored, network, rows, straight
 
-from limsim_jax.maps import load_map
+from limsim_jax.maps import read_network
 from limsim_jax.maps.conflicts import ConflictType, build_conflicts
 from limsim_jax.maps.network import (
     Action,
@@ -175,7 +175,7 @@ def states_in_sumo(path, *options):
 
 
 def test_phases_and_offsets_are_those_of_sumo(grid):
-    net = load_map(grid)
+    net = read_network(grid)
     table = build_signals(net, rows(net))
     assert sorted(table.offset[:-1].tolist()) == [-7, 0, 13, 200]
     programs = list(net.programs)
@@ -189,7 +189,7 @@ def test_phases_and_offsets_are_those_of_sumo(grid):
 
 def test_letters_of_lights_that_are_off(grid):
     """SUMO switched off shows `o` to minor links and `O` to those with right of way."""
-    net = load_map(grid)
+    net = read_network(grid)
     for _, name, state in states_in_sumo(grid, "--tls.all-off")[:4]:
         off = Program(id=name, phases=(Phase(duration=1.0, state=state),))
         table = build_signals(dataclasses.replace(net, programs={**net.programs, name: off}), rows(net))
@@ -406,7 +406,7 @@ def signal_maps():
 @needs_shared
 @pytest.mark.parametrize("path", signal_maps(), ids=lambda path: path.stem)
 def test_lights_of_real_maps_get_safe_programs(path):
-    net = load_map(path)
+    net = read_network(path)
     if not net.traffic_lights:
         pytest.skip("no traffic lights")
     made = generate_programs(dataclasses.replace(net, programs={}, movements=_unsignalled(net)))

@@ -18,7 +18,7 @@ from limsim_jax.policies.host import HostPolicy, Observe
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import Experiment
+from limsim_jax.sweep.experiment import ExperimentFile
 from limsim_jax.traffic.ego import Meta, from_lane
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes
@@ -226,13 +226,13 @@ def test_numbers_that_are_not_finite_end_the_run():
         jax.block_until_ready(ask(HostPolicy(late), dataclasses.replace(state, step=jnp.int32(8))))
 
 
-def experiment(policy) -> Experiment:
+def experiment(policy) -> ExperimentFile:
     told = {
         "name": "host", "map": "highway", "horizon": 2.0, "slots": 8,
         "ego": {"start": "1-", "s": 60.0, "goal": "2-", "policy": f"test_host_policy:{policy}"},
         "traffic": {"vehicles": 3},
     }  # fmt: skip
-    return Experiment.model_validate(told)
+    return ExperimentFile.model_validate(told)
 
 
 def test_an_experiment_names_it():

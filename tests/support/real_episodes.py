@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import Experiment
+from limsim_jax.sweep.experiment import ExperimentFile
 
 
 class Noted(Episodes):
@@ -13,7 +13,9 @@ class Noted(Episodes):
     def __init__(self, note: Path) -> None:
         ego = {"start": "1-", "s": 40.0, "goal": "3+", "policy": "constant_speed"}
         told = {"name": "small", "map": "roundabout", "horizon": 3.0, "slots": 8}
-        super().__init__(Experiment.model_validate(told | {"ego": ego, "traffic": {"vehicles": 6}}), chunk=2)
+        super().__init__(
+            ExperimentFile.model_validate(told | {"ego": ego, "traffic": {"vehicles": 6}}), chunk=2
+        )
         self.note = note
 
     def compile(self):

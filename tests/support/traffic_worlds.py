@@ -7,7 +7,7 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 
-from limsim_jax.maps import build_lane_map, bundled_map, load_map
+from limsim_jax.maps import build_lane_map, bundled_map, read_network
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import Network
 from limsim_jax.traffic.state import start_state
@@ -17,7 +17,7 @@ from limsim_jax.types import Driver, Schedule, Shape, State
 @functools.cache
 def bundled(name: str) -> tuple[Network, LaneMap]:
     """A bundled map and its lane map."""
-    network = load_map(bundled_map(name), cache=False)
+    network = read_network(bundled_map(name), cache=False)
     return network, build_lane_map(network)
 
 

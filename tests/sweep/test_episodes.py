@@ -11,20 +11,20 @@ from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.metrics.safety import encounter, overlaps
 from limsim_jax.policies.simple import ConstantSpeed, FollowLane
 from limsim_jax.sweep.episode import Episodes, _moments, _succeeds
-from limsim_jax.sweep.experiment import Bounds, Experiment
+from limsim_jax.sweep.experiment import Bounds, ExperimentFile
 
 SEEDS = (0, 3, 5)
 SLOTS = 32
 
 
-def experiment(policy: str, **more) -> Experiment:
+def experiment(policy: str, **more) -> ExperimentFile:
     """A short crossing with lights; blind egos do hit others here."""
     told = {
         "name": "crossing", "map": "intersection", "horizon": 20.0, "slots": SLOTS,
         "ego": {"start": "6-", "s": 60.0, "goal": "2", "policy": policy},
         "traffic": {"vehicles": 20, "flow": [{"rate": 350}]},
     }  # fmt: skip
-    return Experiment.model_validate(told | more)
+    return ExperimentFile.model_validate(told | more)
 
 
 @functools.cache

@@ -11,7 +11,7 @@ from limsim_jax.policies.simple import ConstantSpeed
 from limsim_jax.simulation.checkpoint import fork
 from limsim_jax.simulation.rollout import one_world
 from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import EgoTable, Experiment, TrafficTable
+from limsim_jax.sweep.experiment import EgoTable, ExperimentFile, TrafficTable
 from limsim_jax.sweep.what_if import stopped
 
 SEED = 3
@@ -33,7 +33,7 @@ def episodes():
     ego = EgoTable(start="1-", s=40.0, goal="3+", policy="test_what_if:Counting")
     traffic = TrafficTable(vehicles=6)
     values = {"name": "small", "map": "roundabout", "horizon": 10.0, "slots": 8}
-    found = Episodes(Experiment(**values, ego=ego, traffic=traffic), chunk=1)
+    found = Episodes(ExperimentFile(**values, ego=ego, traffic=traffic), chunk=1)
     found.rollout = replace(found.rollout, measure=None)  # metrics take long to compile
     return found
 
@@ -76,7 +76,7 @@ def test_places_of_planned_vehicles_stay_as_many():
     options = {"slots": 3, "around": "follow_lane"}
     ego = EgoTable(start="1-", s=40.0, goal="3+", policy="area_of_interest", options=options)
     values = {"name": "small", "map": "roundabout", "horizon": 10.0, "slots": 8}
-    episodes = Episodes(Experiment(**values, ego=ego, traffic=TrafficTable(vehicles=6)), chunk=1)
+    episodes = Episodes(ExperimentFile(**values, ego=ego, traffic=TrafficTable(vehicles=6)), chunk=1)
     episodes.rollout = replace(episodes.rollout, measure=None)
     run, lane_map, schedule, key, carry = stopped(episodes, SEED, [1.0])
     assert carry.state.egos.slot.shape == (1, 4)

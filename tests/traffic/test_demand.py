@@ -17,7 +17,7 @@ from synthetic import network as network_of
 from synthetic import straight
 from traffic_worlds import bundled, drivers, shapes, state_of
 
-from limsim_jax.maps import load_map
+from limsim_jax.maps import read_network
 from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, build_lane_map, lane_ids, lane_rows
 from limsim_jax.maps.network import MapError
 from limsim_jax.maps.origins import origins
@@ -754,7 +754,7 @@ def test_other_demands_that_make_no_sense():
 def test_shared_sumo_demands(folder, rows, notes):
     """Everybody departs in time on the first edge of the own route; what is not used is said."""
     path = SHARED / "sumo" / folder
-    network = load_map(next(path.glob("*.net.xml")), cache=False)
+    network = read_network(next(path.glob("*.net.xml")), cache=False)
     demand = read_demand(sorted(path.glob("*.rou.xml")), network)
     found = sumo_scenario(network, build_lane_map(network), demand, slots=16)
     schedule = jax.tree.map(np.asarray, found.scenario.schedule)
@@ -822,7 +822,7 @@ def sumo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sumo")
     (folder / "map.net.xml").write_text(NET)
     (folder / "demand.rou.xml").write_text(ROUTES)
-    network = load_map(folder / "map.net.xml", cache=False)
+    network = read_network(folder / "map.net.xml", cache=False)
     return network, build_lane_map(network), read_demand(folder / "demand.rou.xml", network), folder
 
 

@@ -11,7 +11,7 @@ import pytest
 import traffic_against_sumo as referee
 from paths import SHARED, needs_shared
 
-from limsim_jax.maps import build_lane_map, load_map
+from limsim_jax.maps import build_lane_map, read_network
 from limsim_jax.maps.signals import phase_at
 from limsim_jax.maps.sumo_demand import read_demand
 from limsim_jax.traffic.demand.sumo import sumo_scenario
@@ -83,7 +83,7 @@ def test_the_same_vehicles_drive_in_both(tmp_path):
 @needs_shared
 def test_lights_are_where_they_are_in_sumo_when_the_scenario_begins():
     folder = SHARED / "sumo" / "ingolstadt1"
-    network = load_map(folder / "ingolstadt1.net.xml")
+    network = read_network(folder / "ingolstadt1.net.xml")
     lane_map = build_lane_map(network)
     demand = read_demand(folder / "ingolstadt1.rou.xml", network)
     begin = 57600 + 40.0  # 57600 s are whole cycles of 90 s; at 40 s the second phase shows

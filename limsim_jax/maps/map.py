@@ -1,0 +1,113 @@
+"""`Map`: a road network, its device arrays, and the names of its origins and goals, as one host object."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from limsim_jax.maps import build_lane_map, bundled_map, bundled_maps, read_network
+from limsim_jax.maps.network import ImportReport, Network
+
+if TYPE_CHECKING:
+    from limsim_jax.maps.lane_map import LaneMap
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """A road map on the host and on the device.
+
+    Attributes:
+      network: what the file says, float64.
+      extra_goals: ids of lanes that are goals beside the ways out of the map.
+    """
+
+    network: Network
+    extra_goals: tuple[str, ...] = field(default=())
+
+    @property
+    def name(self) -> str:
+        """The file's name without its endings."""
+        name = Path(self.network.source).name
+        for ending in (".gz", ".xodr", ".xml", ".net"):
+            name = name.removesuffix(ending)
+        return name
+
+    @property
+    def source(self) -> str:
+        """Path of the file."""
+        return self.network.source
+
+    @property
+    def report(self) -> ImportReport:
+        """What the reader did with every element of the file."""
+        return self.network.report
+
+    @cached_property
+    def goals(self) -> dict[str, tuple[str, ...]]:
+        """Where vehicles can go: name to the ids of the lanes there, in the order of goal indices."""
+        from limsim_jax.maps.routing import default_goals
+
+        return default_goals(self.network) | {lane: (lane,) for lane in self.extra_goals}
+
+    @cached_property
+    def origins(self) -> dict[str, tuple[str, ...]]:
+        """Where vehicles can come in: name to the ids of the lanes there, from right to left."""
+        from limsim_jax.maps.origins import origins
+
+        return origins(self.network)
+
+    @cached_property
+    def lanes(self) -> LaneMap:
+        """The arrays on the device: look-ups such as `pose` and `to_frenet` take them."""
+        return build_lane_map(self.network, self.goals if self.extra_goals else None)
+
+    @cached_property
+    def lane_ids(self) -> list[str]:
+        """The id of each row of `lanes`."""
+        from limsim_jax.maps.lane_map import lane_ids
+
+        return list(lane_ids(self.network))
+
+    def with_goals(self, lanes: Iterable[str]) -> Map:
+        """The map in which these lanes are goals, too; names of goals and unknown lanes are passed over."""
+        new = [x for x in dict.fromkeys(lanes) if x not in self.goals and x in self.network.lanes]
+        return Map(self.network, (*self.extra_goals, *new)) if new else self
+
+    def __repr__(self) -> str:
+        lanes = list(self.network.drivable_lanes())
+        km = sum(lane.length for lane in lanes) / 1e3
+        return (
+            f"Map '{self.name}': {len(lanes)} drivable lanes, {km:.2f} km, {len(self.network.junctions)} "
+            f"junctions, origins {_listed(self.origins)}, goals {_listed(self.goals)}"
+        )
+
+
+def _listed(names: Iterable[str], most: int = 8) -> str:
+    names = list(names)
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return (", ".join(names[:most]) or "none") + more
+
+
+def load_map(source: str | Path | Network | Map, *, cache: bool = True) -> Map:
+    """Read a map.
+
+    Args:
+      source: an OpenDRIVE (`.xodr`) or SUMO (`.net.xml`) file, also gzipped; the name of a bundled map; or a
+        `Network`.
+      cache: keep what was read on disk, so that the next load of the same bytes is quick.
+
+    Raises:
+      MapError: one line with file, line, element and reason.
+    """
+    if isinstance(source, Map):
+        return source
+    if isinstance(source, Network):
+        return Map(source)
+    if isinstance(source, str) and source in bundled_maps():
+        return Map(read_network(bundled_maps()[source], cache=cache))
+    path = Path(source)
+    named = path if path.exists() or len(path.parts) > 1 or path.suffix else bundled_map(str(source))
+    return Map(read_network(named, cache=cache))
