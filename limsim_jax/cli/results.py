@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from limsim_jax.report.tables import TextTable
     from limsim_jax.sweep.episode import Episodes
+    from limsim_jax.sweep.experiment import ExperimentFile
     from limsim_jax.sweep.runner import Progress
     from limsim_jax.sweep.store import Results
 
