@@ -12,8 +12,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from limsim_jax import bundled_map
 from limsim_jax.bench import bench_traffic
+from limsim_jax.maps import bundled_map
 
 RESULTS = Path(__file__).parent / "results"
 CASES = (("highway", 64), ("intersection", 64), ("roundabout", 64), ("highway", 256), ("highway", 1024))

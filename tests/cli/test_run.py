@@ -7,9 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from limsim_jax import bench, bundled_map, cli, read_network
 from limsim_jax.cli import trace as trace_file
-from limsim_jax.maps import build_lane_map
+from limsim_jax.maps import bench, build_lane_map, bundled_map, cli, read_network
 from limsim_jax.types import Status
 
 SECONDS, SLOTS, START = 3.0, 24, 9
