@@ -287,7 +287,8 @@ def device_poses(network: Network) -> Callable[[Sequence[str], Array], tuple[Arr
     import jax
     import jax.numpy as jnp
 
-    from limsim_jax.maps.lane_map import build_lane_map, lane_rows, pose
+    from limsim_jax.maps.lane_map import lane_rows, pose
+    from limsim_jax.maps.rasterise import build_lane_map
 
     lane_map = build_lane_map(network)
     rows = lane_rows(network)

@@ -343,7 +343,7 @@ def _load(path: str, *, cache: bool) -> tuple[dict[str, Any], Any, Any]:
     import jax
 
     from limsim_jax import maps
-    from limsim_jax.maps import lane_map as _lane_map  # noqa: F401  what build_lane_map needs
+    from limsim_jax.maps import rasterise as _rasterise  # noqa: F401  what build_lane_map needs
 
     jax.devices()
     imported = time.perf_counter()

@@ -57,23 +57,23 @@ def build_lane_map(
     report: ImportReport | None = None,
     cache: bool = True,
 ) -> LaneMap:
-    """Turn a network into device arrays: see `limsim_jax.maps.lane_map.build_lane_map`.
+    """Turn a network into device arrays: see `limsim_jax.maps.rasterise.build_lane_map`.
 
     With `cache` the arrays of a network that comes straight from `read_network` are kept on disk.
     """
     import jax
     import numpy as np
 
-    from limsim_jax.maps import lane_map
+    from limsim_jax.maps import rasterise
 
     notes = ImportReport()
     identity = _loaded.get(network) if cache else None
     name = _cache.key("lanes", *(identity or ()), _spell(goals))
     match _cache.load(name) if identity else None:
-        case (lane_map.LaneMap() as arrays, ImportReport() as notes):
+        case (rasterise.LaneMap() as arrays, ImportReport() as notes):
             built = jax.device_put(arrays)
         case _:
-            built = lane_map.build_lane_map(network, goals, report=notes)
+            built = rasterise.build_lane_map(network, goals, report=notes)
             if identity:
                 _cache.store(name, (jax.tree.map(np.asarray, built), notes))
     if report is not None:

@@ -269,11 +269,11 @@ def test_place_of_the_cache(monkeypatch, tmp_path):
 def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
     import jax
 
-    from limsim_jax.maps import lane_map
+    from limsim_jax.maps import rasterise
     from limsim_jax.maps.routing import default_goals
 
     calls = []
-    build = lane_map.build_lane_map
+    build = rasterise.build_lane_map
 
     def counted(network, goals=None, *, report=None):
         calls.append(goals)
@@ -281,7 +281,7 @@ def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
         report.approximated("lane", "somewhere", "by 1 mm")
         return build(network, goals, report=report)
 
-    monkeypatch.setattr(lane_map, "build_lane_map", counted)
+    monkeypatch.setattr(rasterise, "build_lane_map", counted)
     network = read_network(file)
     goals = default_goals(network)
     assert len(goals) >= 2

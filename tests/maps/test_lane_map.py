@@ -22,6 +22,7 @@ from limsim_jax.maps.network import (
     Road,
     StopLine,
 )
+from limsim_jax.maps.rasterise import TOLERANCE, TURN_WINDOW, build_lane_map
 
 GAUSS_X, GAUSS_W = np.polynomial.legendre.leggauss(8)
 
@@ -133,7 +134,7 @@ def host():
 
 @pytest.fixture(scope="module")
 def device(host):
-    return lm.build_lane_map(host)
+    return build_lane_map(host)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +162,7 @@ project = jax.jit(lm.project)
 @pytest.mark.parametrize("radius", [6.0, -15.0, 200.0])
 def test_arc(radius):
     length = min(1.5 * np.pi * abs(radius), 600.0)
-    lane_map = lm.build_lane_map(network(Line((length, 1 / radius, 1 / radius)).lane("a")))
+    lane_map = build_lane_map(network(Line((length, 1 / radius, 1 / radius)).lane("a")))
     s = np.linspace(0, length, 3001)
     x, y, heading = (np.asarray(v, float) for v in pose(lane_map, 0, jnp.asarray(s, jnp.float32)))
     x, y = lm.absolute(lane_map, x, y)
@@ -174,7 +175,7 @@ def test_arc(radius):
 
 def test_clothoid_against_fresnel_integrals():
     length, bend = 80.0, 1 / 20
-    lane_map = lm.build_lane_map(network(Line((length, 0.0, bend)).lane("a")))
+    lane_map = build_lane_map(network(Line((length, 0.0, bend)).lane("a")))
     s = np.linspace(0, length, 2001)
     scale = np.sqrt(np.pi * length / bend)
     sin, cos = fresnel(s / scale)
@@ -190,7 +191,7 @@ def test_clothoid_against_fresnel_integrals():
 def test_curvature_jumps_where_the_lane_does_though_a_sample_has_one_value(reverse):
     line = Line((40.0, 0.02, 0.02), (40.0, 0.0, 0.0), (40.0, -0.01, -0.01), step=8.0)
     lane = line.lane("a", reverse=reverse)
-    lane_map = lm.build_lane_map(network(lane))
+    lane_map = build_lane_map(network(lane))
     s = np.array([1.0, 20.0, 38.0, 42.0, 60.0, 78.0, 82.0, 100.0, 119.0])
     truth = np.repeat([0.02, 0.0, -0.01], 3)
     s, truth = (120 - s, -truth) if reverse else (s, truth)
@@ -198,7 +199,7 @@ def test_curvature_jumps_where_the_lane_does_though_a_sample_has_one_value(rever
 
 
 def test_lateral_offset_is_to_the_left():
-    lane_map = lm.build_lane_map(network(Line((40.0, 0.0, 0.0), heading=np.pi / 2).lane("north")))
+    lane_map = build_lane_map(network(Line((40.0, 0.0, 0.0), heading=np.pi / 2).lane("north")))
     x, y, heading = pose(lane_map, 0, jnp.float32(10), jnp.float32(2))
     np.testing.assert_allclose(lm.absolute(lane_map, x, y), [-2, 10], atol=1e-5)
     np.testing.assert_allclose(heading, np.pi / 2, rtol=1e-6)
@@ -226,8 +227,8 @@ def test_device_lane_follows_host_lane(host, device, rows, name):
     place, angle = lane.pose(s)
     x, y, heading = pose(device, row, s)
     ours = np.stack(lm.absolute(device, x, y), -1)
-    assert np.hypot(*(ours - place[:, :2]).T).max() < lm.TOLERANCE["position"] + 1e-4
-    assert np.abs(np.angle(np.exp(1j * (np.asarray(heading) - angle)))).max() < 1.1 * lm.TOLERANCE["heading"]
+    assert np.hypot(*(ours - place[:, :2]).T).max() < TOLERANCE["position"] + 1e-4
+    assert np.abs(np.angle(np.exp(1j * (np.asarray(heading) - angle)))).max() < 1.1 * TOLERANCE["heading"]
     np.testing.assert_allclose(lm.width(device, row, s), lane.width_at(s), atol=1.1e-3)
     np.testing.assert_allclose(lm.elevation(device, row, s)[0], place[:, 2], atol=1e-2)
 
@@ -242,7 +243,7 @@ def test_elevation_and_grade(host, device, rows):
 def test_spacing_is_a_power_of_two_and_coarse_where_the_lane_is_simple():
     bends = [(16.0, 0.0, 0.0), (16.0, 1 / 500, 1 / 500), (16.0, 1 / 20, 1 / 20), (16.0, 1 / 5, 1 / 5)]
     lanes = [Line(bend, x=50.0 * k).lane(str(k), road=str(k)) for k, bend in enumerate(bends)]
-    ds = np.asarray(lm.build_lane_map(network(*lanes)).ds)[:4]
+    ds = np.asarray(build_lane_map(network(*lanes)).ds)[:4]
     assert (np.diff(ds[1:]) < 0).all()
     assert ds[0] == 16.0
     assert (np.log2(ds) % 1 == 0).all()
@@ -256,11 +257,11 @@ def test_kinked_lane_is_followed_and_reported(host, device, rows):
     assert deviation.max() < 0.01
     assert np.median(deviation) < 1e-4
     report = ImportReport()
-    lm.build_lane_map(host, report=report)
+    build_lane_map(host, report=report)
     assert [note.where for note in report.notes] == ["kinked"]
     assert report.total(Action.APPROXIMATED) == 1
     # A driver takes 0.3 rad over four metres, not the infinite curvature of the kink.
-    np.testing.assert_allclose(device.curvature_max[rows["kinked"]], 0.3 / lm.TURN_WINDOW, rtol=1e-3)
+    np.testing.assert_allclose(device.curvature_max[rows["kinked"]], 0.3 / TURN_WINDOW, rtol=1e-3)
 
 
 def test_a_step_in_width_stays_a_step():
@@ -274,7 +275,7 @@ def test_a_step_in_width_stays_a_step():
         "width": np.where(s > 30, 5.0, 3.0),
     }
     zeros = {"heading": 0 * s, "curvature": 0 * s}
-    lane_map = lm.build_lane_map(network(dataclasses.replace(lane, **fields, **zeros)))
+    lane_map = build_lane_map(network(dataclasses.replace(lane, **fields, **zeros)))
     width = lm.width(lane_map, 0, jnp.array([20.0, 29.4, 30.6, 40.0]))
     np.testing.assert_allclose(width, [3.0, 3.0, 5.0, 5.0], atol=1e-3)
 
@@ -328,7 +329,7 @@ def test_lane_tables_say_what_the_network_says(host, device, rows):
 def test_turn_speed(device, rows):
     fast = lm.turn_speed(device, jnp.array([rows["turn"], rows["inner"]]), 3.0)
     np.testing.assert_allclose(fast, [np.sqrt(3.0 * 6.0), np.sqrt(3.0 * 12.0)], rtol=2e-3)
-    straight = lm.build_lane_map(network(Line((40.0, 0.0, 0.0)).lane("a")))
+    straight = build_lane_map(network(Line((40.0, 0.0, 0.0)).lane("a")))
     np.testing.assert_allclose(lm.turn_speed(straight, 0, 3.0), 13.9)
 
 
@@ -336,7 +337,7 @@ def test_more_links_than_usual_fit():
     line = Line((20.0, 0.0, 0.0))
     many = [line.lane(f"b{k}", number=k) for k in range(7)]
     fork = line.lane("fork", road="2", successors=tuple(lane.id for lane in many))
-    lane_map = lm.build_lane_map(network(fork, *many))
+    lane_map = build_lane_map(network(fork, *many))
     assert lane_map.successors[0].tolist() == [1, 2, 3, 4, 5, 6, 7, -1]
 
 
@@ -359,7 +360,7 @@ def long_network(single):
 @pytest.mark.parametrize("single", [True, False])
 def test_round_trip_on_ten_kilometres(single):
     host = long_network(single)
-    lane_map = lm.build_lane_map(host)
+    lane_map = build_lane_map(host)
     rng = np.random.default_rng(3)
     lane = rng.integers(0, len(host.lanes), 100_000)
     s = (rng.uniform(0, 1, len(lane)) * np.asarray(lane_map.length)[lane]).astype(np.float32)
@@ -462,7 +463,7 @@ def test_project_far_away_or_of_nan_is_no_lane(device):
 @pytest.mark.parametrize("name", ["inner", "outer", "turn", "kinked"])
 def test_gradients_equal_finite_differences(host, name):
     with jax.enable_x64(True):
-        lane_map, row, lane = double(lm.build_lane_map(host)), lm.lane_rows(host)[name], host.lanes[name]
+        lane_map, row, lane = double(build_lane_map(host)), lm.lane_rows(host)[name], host.lanes[name]
         rng = np.random.default_rng(8)
         # Ends and beyond them, too; away from interval bounds, where the second derivative steps.
         s = np.concatenate([rng.uniform(0, lane.length, 40), [-3.0, lane.length + 3.0]])
@@ -532,7 +533,7 @@ def test_gradients_are_finite_where_a_lane_turns_on_the_spot(device):
 def test_gradients_on_interval_bounds_are_those_of_one_side():
     """Not half of them, as a clip has on its bounds."""
     radius = 50.0
-    lane_map = lm.build_lane_map(network(Line((40.0, 1 / radius, 1 / radius)).lane("a")))
+    lane_map = build_lane_map(network(Line((40.0, 1 / radius, 1 / radius)).lane("a")))
     bounds = jnp.arange(0, 40, float(lane_map.ds[0]))
     turn = jax.vmap(jax.grad(lambda s: lm.pose(lane_map, 0, s)[2]))(bounds)
     np.testing.assert_allclose(turn, 1 / radius, rtol=0.02)
@@ -562,8 +563,8 @@ def test_maps_in_the_same_buckets_share_one_program():
         traces.append(1)
         return lm.pose(lane_map, 0, s), lm.to_frenet(lane_map, 0, s, x, x), lm.project(lane_map, x, x)
 
-    one = lm.build_lane_map(network(Line((200.0, 0.0, 0.0)).lane("a")))
-    other = lm.build_lane_map(example())
+    one = build_lane_map(network(Line((200.0, 0.0, 0.0)).lane("a")))
+    other = build_lane_map(example())
     for lane_map in (one, other):
         drive(lane_map, jnp.float32(3), jnp.float32(1))
     assert len(traces) == 1
@@ -573,7 +574,7 @@ def test_maps_in_the_same_buckets_share_one_program():
 def test_padding_does_not_matter(host, device, rows):
     """The same lanes in a map with many others, in larger buckets, give the same bits."""
     more = [Line((60.0, 0.0, 0.0), x=-500.0 + 5 * k).lane(f"+{k}", road=f"+{k}") for k in range(100)]
-    lane_map = lm.build_lane_map(network(*host.lanes.values(), *more))
+    lane_map = build_lane_map(network(*host.lanes.values(), *more))
     assert lane_map.first.shape > device.first.shape
     shift = np.asarray(lane_map.origin - device.origin, np.float32)
     lane_map = dataclasses.replace(lane_map, rows=lane_map.rows.at[:, 0].add(shift[0]).at[:, 4].add(shift[1]))
@@ -634,8 +635,8 @@ def test_leaves_are_arrays_of_device_types(device):
 def test_far_coordinates_lose_nothing():
     """UTM northings: float32 alone would round them to half a metre."""
     far = (691_000.25, 5_335_000.75)
-    near_map = lm.build_lane_map(network(Line(*WINDING, x=0.25, y=0.75).lane("a")))
-    far_map = lm.build_lane_map(network(Line(*WINDING, x=far[0], y=far[1]).lane("a")))
+    near_map = build_lane_map(network(Line(*WINDING, x=0.25, y=0.75).lane("a")))
+    far_map = build_lane_map(network(Line(*WINDING, x=far[0], y=far[1]).lane("a")))
     s = jnp.linspace(0.0, 300.0, 500)
     near, away = (np.stack(lm.absolute(m, *pose(m, 0, s)[:2]), -1) for m in (near_map, far_map))
     np.testing.assert_allclose(away - near, [[691_000, 5_335_000]] * 500, atol=1e-4)
@@ -646,14 +647,14 @@ def test_far_coordinates_lose_nothing():
 def test_bad_networks_are_refused_with_a_map_error():
     good = Line((20.0, 0.0, 0.0)).lane("a")
     with pytest.raises(MapError, match=r"test\.xodr.*no lane"):
-        lm.build_lane_map(network(dataclasses.replace(good, type=LaneType.SIDEWALK)))
+        build_lane_map(network(dataclasses.replace(good, type=LaneType.SIDEWALK)))
     with pytest.raises(MapError, match=r"lane 'a'.*finite"):
-        lm.build_lane_map(network(dataclasses.replace(good, width=np.full_like(good.width, np.nan))))
+        build_lane_map(network(dataclasses.replace(good, width=np.full_like(good.width, np.nan))))
     with pytest.raises(MapError, match=r"lane 'a'.*'gone'"):
-        lm.build_lane_map(network(dataclasses.replace(good, left="gone")))
+        build_lane_map(network(dataclasses.replace(good, left="gone")))
 
 
 def test_a_lane_that_cannot_be_followed_is_refused(host, monkeypatch):
     monkeypatch.setattr(lm, "WORST_DEVIATION", 0.003)
     with pytest.raises(MapError, match=r"lane 'kinked'.*leave the centre line by 0\.00"):
-        lm.build_lane_map(host)
+        build_lane_map(host)

@@ -12,8 +12,9 @@ from synthetic import arc, lane_along, network, straight
 from traffic_worlds import bundled, drivers, shapes
 
 from limsim_jax.geometry import box_separation
-from limsim_jax.maps.lane_map import build_lane_map, lane_rows
+from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.network import ImportReport
+from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.metrics.observer import _zones
 from limsim_jax.traffic.engine import Command, Traffic, _until_changed, drive
 from limsim_jax.traffic.lane_change import place_beside

@@ -18,9 +18,10 @@ from synthetic import straight
 from traffic_worlds import bundled, drivers, shapes, state_of
 
 from limsim_jax.maps import read_network
-from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, build_lane_map, lane_ids, lane_rows
+from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, lane_ids, lane_rows
 from limsim_jax.maps.network import MapError
 from limsim_jax.maps.origins import origins
+from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.sumo_demand import read_demand
 from limsim_jax.traffic.car_following import safe_speed

@@ -11,7 +11,8 @@ from synthetic import network, straight
 from traffic_worlds import bundled, drivers, scattered, shapes, state_of
 
 from limsim_jax.geometry import box_separation
-from limsim_jax.maps.lane_map import build_lane_map, curvature, lane_rows, width
+from limsim_jax.maps.lane_map import curvature, lane_rows, width
+from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.traffic.car_following import ACC, IDM
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.engine import PATIENCE, Traffic, _give_up, drive

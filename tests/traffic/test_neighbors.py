@@ -9,7 +9,8 @@ import pytest
 from synthetic import network, straight
 from traffic_worlds import bundled, scattered, shapes, state_of
 
-from limsim_jax.maps.lane_map import NO_LANE, build_lane_map, lane_rows
+from limsim_jax.maps.lane_map import NO_LANE, lane_rows
+from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.neighbors import (
     lanes_ahead,

@@ -13,8 +13,9 @@ from scipy.optimize import curve_fit
 from synthetic import arc, curve, intersection, network, straight
 from traffic_worlds import bundled, drivers, shapes, state_of
 
-from limsim_jax.maps.lane_map import LaneMap, build_lane_map, lane_rows
+from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import Control
+from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.signals import SignalState, phase_at
 from limsim_jax.simulation.rollout import Rollout, world_key
