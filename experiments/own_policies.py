@@ -14,7 +14,7 @@ import numpy as np
 
 from limsim_jax.maps.signals import SignalState
 from limsim_jax.policies.host import HostPolicy
-from limsim_jax.policies.reference import body_lane, place_on, way_ahead
+from limsim_jax.policies.reference import center_lane, reference_path, to_cartesian
 from limsim_jax.traffic.ego import Trajectory
 from limsim_jax.traffic.engine import Command
 
@@ -30,11 +30,11 @@ class Cautious:  # policy = "my_package.drivers:Cautious"
 
     def __call__(self, config, lane_map, state, memory, key):
         slot = state.egos.slot
-        lane, s = body_lane(lane_map, state, slot)  # of limsim_jax.policies.reference
-        way = way_ahead(lane_map, lane, s, state.goal[slot], points=60, step=2.0)
+        lane, s = center_lane(lane_map, state, slot)  # of limsim_jax.policies.reference
+        way = reference_path(lane_map, lane, s, state.goal[slot], points=60, step=2.0)
         v = jnp.minimum(state.v[slot], self.share * way.limit[:, 0])[:, None]
         along = v * 0.2 * jnp.arange(16)[None]
-        place = place_on(way, along, 0 * along)
+        place = to_cartesian(way, along, 0 * along)
         now = config.time(state.step)
         trajectory = Trajectory(x=place.x, y=place.y, heading=place.heading, v=v + 0 * along, t0=now, dt=0.2)
         return Command(trajectory=trajectory), memory

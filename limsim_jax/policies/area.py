@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.base import Policy, made, variants
+from limsim_jax.policies.base import Policy, build_policy, variants
 from limsim_jax.policies.predict import Predictor
 from limsim_jax.traffic.ego import Egos, Trajectory, assign
 from limsim_jax.traffic.engine import Command
@@ -195,7 +195,7 @@ def _named(policy: Policy | str, options: dict[str, Any]) -> Policy:
     if policy not in POLICIES or policy == "area_of_interest":
         known = ", ".join(name for name in POLICIES if name != "area_of_interest")
         raise ValueError(f"unknown policy '{policy}'; known are {known}")
-    return made(POLICIES[policy], options)
+    return build_policy(POLICIES[policy], options)
 
 
 def _with_others(policy: Policy, count: int) -> Policy:

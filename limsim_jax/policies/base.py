@@ -39,7 +39,7 @@ class Policy(Protocol):
         ...
 
 
-def made(factory: Callable[..., Policy], options: Mapping[str, Any]) -> Policy:
+def build_policy(factory: Callable[..., Policy], options: Mapping[str, Any]) -> Policy:
     """The policy that an experiment file describes.
 
     Raises:

@@ -36,8 +36,8 @@ import numpy as np
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.maps.signals import SignalState, lane_states
-from limsim_jax.policies.predict import nearest, straight
-from limsim_jax.policies.reference import body_lane, way_ahead
+from limsim_jax.policies.predict import constant_velocity, nearest
+from limsim_jax.policies.reference import center_lane, reference_path
 from limsim_jax.traffic.ego import Control, Trajectory
 from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, State
@@ -51,7 +51,7 @@ _LANES = 4  # beyond the own one, for lights
 
 
 class Observation(NamedTuple):
-    """What the egos see, `[B, E]`: `B` worlds, `E` egos, `M` points of the way, `K` others.
+    """What the egos see, `[B, E]`: `B` worlds, `E` egos, `M` points of the path, `K` others.
 
     Places are in the frame of the ego: x ahead of the centre of its body, y to the left. Numbers of others
     that are not `there`, and of rows of egos without a vehicle, mean nothing.
@@ -65,7 +65,7 @@ class Observation(NamedTuple):
     width: Any
     wheelbase: Any
     limit: Any  # m/s
-    light: Any  # `SignalState` of the next light on the way
+    light: Any  # `SignalState` of the next light on the path
     light_distance: Any  # m from the front bumper to its stop line, `FAR` if there is none
     to_go: Any  # lanes to cross for the route, left > 0
     to_go_within: Any  # m
@@ -88,7 +88,7 @@ class Observe:
 
     Attributes:
       nearest: others, `K`.
-      points: of the way, `M`.
+      points: of the path, `M`.
       step: m between them.
     """
 
@@ -105,12 +105,12 @@ class Observe:
             dx, dy = x - egos.x[:, None], y - egos.y[:, None]
             return cos * dx + sin * dy, cos * dy - sin * dx
 
-        lane, s = body_lane(lane_map, state, slot)
+        lane, s = center_lane(lane_map, state, slot)
         goal = state.goal[slot]
         after = jnp.where(lane == state.lane[slot], NO_LANE, state.lane[slot])
-        way = way_ahead(lane_map, lane, s, goal, points=self.points, step=self.step, after=after)
-        way_x, way_y = frame(way.x, way.y)
-        now = straight(lane_map, state, jnp.zeros(1, state.v.dtype))
+        path = reference_path(lane_map, lane, s, goal, points=self.points, step=self.step, after=after)
+        way_x, way_y = frame(path.x, path.y)
+        now = constant_velocity(lane_map, state, jnp.zeros(1, state.v.dtype))
         near = nearest(lane_map, state, now, slot, self.nearest)
         other_x, other_y = frame(now.x[near, 0], now.y[near, 0])
         light, distance = _next_light(lane_map, state)
@@ -130,8 +130,8 @@ class Observe:
             to_go_within=lane_map.routes.change_distance[own, goal] - state.s[slot],
             way_x=way_x,
             way_y=way_y,
-            way_heading=wrap_angle(way.heading - egos.heading[:, None]),
-            way_limit=way.limit,
+            way_heading=wrap_angle(path.heading - egos.heading[:, None]),
+            way_limit=path.limit,
             there=near >= 0,
             other_x=other_x,
             other_y=other_y,

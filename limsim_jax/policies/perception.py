@@ -11,12 +11,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.predict import Prediction
-from limsim_jax.policies.reference import Way, nearest_on
+from limsim_jax.policies.reference import ReferencePath, project_onto
 from limsim_jax.traffic.ego import at_slots
 from limsim_jax.traffic.engine import Command, Decision, Traffic, decide
 from limsim_jax.types import Config, State
 
-_NEXT_LANE = 5.0  # m off the way, from which somebody may be changing to it
+_NEXT_LANE = 5.0  # m off the path, from which somebody may be changing to it
 
 
 class Around(NamedTuple):
@@ -24,10 +24,10 @@ class Around(NamedTuple):
 
     slot: Int[Array, "V K"]
     there: Bool[Array, "V K"]
-    s: Float[Array, "V K"]  # m from centre to centre along the way
-    d: Float[Array, "V K"]  # m off the way
+    s: Float[Array, "V K"]  # m from centre to centre along the path
+    d: Float[Array, "V K"]  # m off the path
     gap: Float[Array, "V K"]  # m between bumpers; positive ahead of us and behind us alike
-    v: Float[Array, "V K"]  # m/s along the way
+    v: Float[Array, "V K"]  # m/s along the path
     on_way: Bool[Array, "V K"]  # its body is on the lane that the way follows
 
 
@@ -45,8 +45,10 @@ def rules(
     return jnp.where(now[egos.slot] == 0, after.side[egos.slot], 0), decision
 
 
-def around(state: State, prediction: Prediction, way: Way, slot: Int[Array, " V"], count: int) -> Around:
-    """The others that come nearest within the next seconds, and where they are on the way."""
+def around(
+    state: State, prediction: Prediction, path: ReferencePath, slot: Int[Array, " V"], count: int
+) -> Around:
+    """The others that come nearest within the next seconds, and where they are on the path."""
     number = state.lane.shape[0]
     x, y = prediction.x, prediction.y  # [N H]
     mine = jnp.arange(number)[None] == slot[:, None]
@@ -61,7 +63,7 @@ def around(state: State, prediction: Prediction, way: Way, slot: Int[Array, " V"
     near, index = lax.top_k(-away, min(count, number))
     there = near > -1e11
     ox, oy = x[index, 0], y[index, 0]
-    s, d, along = nearest_on(way, ox, oy)
+    s, d, along = project_onto(path, ox, oy)
     turned = prediction.heading[index, 0] - along
     half = (
         jnp.abs(jnp.cos(turned)) * state.shape.width[index]
@@ -71,6 +73,6 @@ def around(state: State, prediction: Prediction, way: Way, slot: Int[Array, " V"
         there & (jnp.abs(d) < half / 2 + state.shape.width[slot][:, None] / 2 + 0.1) & (jnp.cos(turned) > 0.3)
     )
     joins = there & (state.side[index] * jnp.sign(d).astype(jnp.int32) < 0) & (jnp.abs(d) < _NEXT_LANE)
-    on_way = (on_way | joins) & (jnp.abs(s) < way.reach)
+    on_way = (on_way | joins) & (jnp.abs(s) < path.reach)
     lengths = (state.shape.length[index] + state.shape.length[slot][:, None]) / 2
     return Around(index, there, s, d, jnp.abs(s) - lengths, state.v[index] * jnp.cos(turned), on_way)

@@ -1,7 +1,7 @@
 """Where others will be: predictions of all vehicles as arrays, for planners to keep clear of.
 
-A `Predictor` is a function; a planner takes any. Here are: `constant_velocity` along the route, `straight`
-along the heading, as in PDM (Dauner et al., CoRL 2023), and `Recalled`, what came to pass. They take over
+A `Predictor` is a function; a planner takes any. Here are: `along_route` along the route, `constant_velocity`
+along the heading, as in PDM (Dauner et al., CoRL 2023), and `Replayed`, what came to pass. They take over
 what planned vehicles let others know, see `shared`. `hypotheses` has several futures of a vehicle where lanes
 split. Without gradient through which lane a vehicle is on.
 """
@@ -90,7 +90,7 @@ class Predictor(Protocol):
 
 
 @jax.named_scope("predict")
-def constant_velocity(
+def along_route(
     lane_map: LaneMap,
     state: State,
     times: Float[Array, " H"],
@@ -112,7 +112,7 @@ def constant_velocity(
 
 
 @jax.named_scope("predict")
-def straight(
+def constant_velocity(
     lane_map: LaneMap,
     state: State,
     times: Float[Array, " H"],
@@ -120,13 +120,13 @@ def straight(
     stop: Float[Array, " N"] | None = None,
     plans: Plans | None = None,
 ) -> Prediction:
-    """Everybody goes straight on at its speed. `stop` as in `constant_velocity`."""
+    """Everybody goes straight on at its speed. `stop` as in `along_route`."""
     box = boxes(lane_map, state)
-    way, _ = _travelled(state, times, stop)
-    heading = jnp.broadcast_to(box[:, 2:3], way.shape)
+    distance, _ = _travelled(state, times, stop)
+    heading = jnp.broadcast_to(box[:, 2:3], distance.shape)
     prediction = Prediction(
-        x=box[:, 0:1] + way * jnp.cos(heading),
-        y=box[:, 1:2] + way * jnp.sin(heading),
+        x=box[:, 0:1] + distance * jnp.cos(heading),
+        y=box[:, 1:2] + distance * jnp.sin(heading),
         heading=heading,
         length=box[:, 3],
         width=box[:, 4],
@@ -166,7 +166,7 @@ def shared(
 
 
 @dataclass(frozen=True)
-class Recalled:
+class Replayed:
     """What came to pass: a predictor for worlds that run a second time.
 
     Each vehicle moves as it did in the first run, from where it is now. A slot that another vehicle took
@@ -225,7 +225,7 @@ def hypotheses(
       modes: `M`; successors beyond that many are left out.
       known: probability of the way that the route takes, and the rest in equal shares; None: nobody knows
         the route, so all successors are equally likely.
-      stop: as in `constant_velocity`, for all of them.
+      stop: as in `along_route`, for all of them.
     """
     if known is not None and not 0 <= known <= 1:
         raise ValueError(f"known: a probability of {known}; it must be within 0 and 1")
@@ -330,8 +330,8 @@ def _travelled(
     b = jnp.maximum(STOPPING, v * v / jnp.maximum(2 * room, 0.1))
     begin = jnp.maximum(room - v * v / (2 * b), 0) / jnp.maximum(v, 1e-3)  # s from now
     braking = jnp.clip(t - begin, 0, v / b)
-    way = v * jnp.minimum(t, begin) + v * braking - b * braking * braking / 2
-    return jnp.minimum(way, room), v - b * braking
+    distance = v * jnp.minimum(t, begin) + v * braking - b * braking * braking / 2
+    return jnp.minimum(distance, room), v - b * braking
 
 
 def _along(
@@ -343,8 +343,8 @@ def _along(
     times: Float[Array, " H"],
     stop: Float[Array, " N"] | None,
 ) -> tuple[Float[Array, "N H"], Float[Array, "N H"], Float[Array, "N H"]]:
-    way, v = _travelled(state, times, stop)
-    at = start.s[:, None] + way
+    distance, v = _travelled(state, times, stop)
+    at = start.s[:, None] + distance
     # lanes of the route count from the start of the first one; before it lies the one it came from
     begins = begins - begins[:, :1]
     which = jnp.maximum(jnp.sum(begins[:, None, :] <= at[:, :, None], -1) - 1, 0)

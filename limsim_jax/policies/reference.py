@@ -1,7 +1,7 @@
-"""The way ahead of vehicles as a row of points, and places on it: what planners plan along.
+"""The reference path of a vehicle: points along its route, along which planners plan.
 
-A `Way` begins where the centre of the body is (arc length 0) and follows the route of the vehicle along
-the middle of its lanes.
+A `ReferencePath` begins at the centre of the body (arc length 0) and follows the route along the middle of
+the lanes.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from limsim_jax.xla import interval
 
 
 @struct.dataclass(frozen=True, kw_only=True)
-class Way:
+class ReferencePath:
     """Ways of `V` vehicles: `M` points each, `step` m apart along the lanes of their routes."""
 
     x: Float[Array, "V M"]  # m
     y: Float[Array, "V M"]
-    heading: Float[Array, "V M"]  # rad, without jumps along the way
+    heading: Float[Array, "V M"]  # rad, without jumps along the path
     curvature: Float[Array, "V M"]  # 1/m
     limit: Float[Array, "V M"]  # m/s, speed limit
     left: Float[Array, "V M"]  # m from the middle of the lane to the edge of the roadway, both > 0
@@ -54,7 +54,7 @@ class Frenet(NamedTuple):
     bend: Float[Array, " V"]  # 1/m, second derivative of d over s
 
 
-def way_ahead(
+def reference_path(
     lane_map: LaneMap,
     lane: Int[Array, " V"],
     s: Float[Array, " V"],
@@ -64,7 +64,7 @@ def way_ahead(
     step: float,
     lanes: int = 5,
     after: Int[Array, " V"] | None = None,
-) -> Way:
+) -> ReferencePath:
     """Ways from `s` (m) on `lane` along the route to `goal`.
 
     Args:
@@ -104,7 +104,7 @@ def way_ahead(
         return half + jnp.where(other == NO_LANE, 0, width(lane_map, other, place))
 
     inside = there <= lane_map.length[here]
-    return Way(
+    return ReferencePath(
         x=x,
         y=y,
         heading=heading,
@@ -118,7 +118,7 @@ def way_ahead(
     )
 
 
-def body_lane(lane_map: LaneMap, state: State, slot: Int[Array, " V"]) -> tuple[Array, Array]:
+def center_lane(lane_map: LaneMap, state: State, slot: Int[Array, " V"]) -> tuple[Array, Array]:
     """Lane and arc length (m) of the centres of the bodies in these slots."""
     return body_place(
         lane_map, state.lane[slot], state.previous[slot], state.s[slot], state.shape.length[slot]
@@ -148,26 +148,26 @@ def beside(
     )
 
 
-def motion_on(way: Way, state: State, slot: Int[Array, " V"], d: Float[Array, " V"]) -> Frenet:
+def motion_on(path: ReferencePath, state: State, slot: Int[Array, " V"], d: Float[Array, " V"]) -> Frenet:
     """How the vehicles in these slots move along and across their ways, `d` m off their first points.
 
     Free egos by their heading in the plane, the others by the progress of their lane change.
     """
     v, a, egos = state.v[slot], state.a[slot], state.egos
-    astray, steered = jnp.zeros_like(v), way.curvature[:, 0]
+    astray, steered = jnp.zeros_like(v), path.curvature[:, 0]
     free = jnp.zeros(slot.shape, bool)
     if egos.slot.shape[0]:
         mine = (egos.slot[None, :] == slot[:, None]) & egos.free[None, :]  # [V E]
         free, pick = mine.any(-1), jnp.argmax(mine, -1)
         slip = jnp.arctan(jnp.tan(egos.steering[pick]) / 2)
-        off = wrap_angle(egos.heading[pick] + slip - way.heading[:, 0])
+        off = wrap_angle(egos.heading[pick] + slip - path.heading[:, 0])
         astray = jnp.where(free, jnp.clip(off, -1.0, 1.0), astray)
         turned = jnp.sin(slip) * 2 / state.shape.wheelbase[slot]
         steered = jnp.where(free, turned, steered)
         a = jnp.where(free, egos.a[pick], a)
-    stretch = jnp.maximum(1 - way.curvature[:, 0] * d, 0.2)
+    stretch = jnp.maximum(1 - path.curvature[:, 0] * d, 0.2)
     slope = jnp.where(free, jnp.tan(astray), lateral_speed(state)[slot] / jnp.maximum(v, 0.5)) * stretch
-    bend = steered - way.curvature[:, 0]
+    bend = steered - path.curvature[:, 0]
     along = v * jnp.cos(astray) / stretch
     return Frenet(
         s=jnp.zeros_like(v), v=along, a=a, d=d, d_v=slope * along, d_a=bend * along * along,
@@ -180,27 +180,27 @@ class Place(NamedTuple):
 
     x: Float[Array, ...]  # m
     y: Float[Array, "*b"]
-    heading: Float[Array, ...]  # rad, of the way
-    curvature: Float[Array, ...]  # 1/m, of the way
+    heading: Float[Array, ...]  # rad, of the path
+    curvature: Float[Array, ...]  # 1/m, of the path
 
 
-def place_on(way: Way, s: Float[Array, "V ..."], d: Float[Array, "V ..."]) -> Place:
+def to_cartesian(path: ReferencePath, s: Float[Array, "V ..."], d: Float[Array, "V ..."]) -> Place:
     """Cartesian place `s` m along and `d` m left of each way: a cubic Hermite curve between its points.
 
     Beyond its last point a way goes straight on, before its first one straight back.
     """
     flat = (s.shape[0], -1)
     s_, d_ = s.reshape(flat), jnp.broadcast_to(d, s.shape).reshape(flat)
-    k, u = interval(s_ / way.step, way.x.shape[-1] - 1)
+    k, u = interval(s_ / path.step, path.x.shape[-1] - 1)
     inside = jnp.clip(u, 0, 1)
-    rest = (u - inside) * way.step
+    rest = (u - inside) * path.step
 
     def at(table: Float[Array, "V M"], n: int) -> Array:
         return jnp.take_along_axis(table, k + n, -1)
 
-    x0, x1, y0, y1 = at(way.x, 0), at(way.x, 1), at(way.y, 0), at(way.y, 1)
-    h0, h1, c0, c1 = at(way.heading, 0), at(way.heading, 1), at(way.curvature, 0), at(way.curvature, 1)
-    h = way.step
+    x0, x1, y0, y1 = at(path.x, 0), at(path.x, 1), at(path.y, 0), at(path.y, 1)
+    h0, h1, c0, c1 = at(path.heading, 0), at(path.heading, 1), at(path.curvature, 0), at(path.curvature, 1)
+    h = path.step
     cos0, sin0, cos1, sin1 = jnp.cos(h0), jnp.sin(h0), jnp.cos(h1), jnp.sin(h1)
     t2 = inside * inside
     t3 = t2 * inside
@@ -215,20 +215,20 @@ def place_on(way: Way, s: Float[Array, "V ..."], d: Float[Array, "V ..."]) -> Pl
     return Place(*(value.reshape(s.shape) for value in (x, y, heading, bend)))
 
 
-def nearest_on(
-    way: Way, x: Float[Array, "V ..."], y: Float[Array, "V ..."]
+def project_onto(
+    path: ReferencePath, x: Float[Array, "V ..."], y: Float[Array, "V ..."]
 ) -> tuple[Float[Array, "V ..."], Float[Array, "V ..."], Float[Array, "V ..."]]:
     """Where places are on each way: m along, m left of it, and the heading of the way there, rad.
 
-    Level with the nearest point of the way, so exact on straights and to half a step squared times the
+    Level with the nearest points of the path, so exact on straights and to half a step squared times the
     curvature in bends.
     """
     flat = (x.shape[0], -1)
     x_, y_ = x.reshape(flat), y.reshape(flat)
-    far = (x_[..., None] - way.x[:, None]) ** 2 + (y_[..., None] - way.y[:, None]) ** 2
+    far = (x_[..., None] - path.x[:, None]) ** 2 + (y_[..., None] - path.y[:, None]) ** 2
     k = jnp.argmin(far, -1)
-    heading = jnp.take_along_axis(way.heading, k, 1)
+    heading = jnp.take_along_axis(path.heading, k, 1)
     cos, sin = jnp.cos(heading), jnp.sin(heading)
-    dx, dy = x_ - jnp.take_along_axis(way.x, k, 1), y_ - jnp.take_along_axis(way.y, k, 1)
-    s, d = k.astype(dx.dtype) * way.step + dx * cos + dy * sin, -dx * sin + dy * cos
+    dx, dy = x_ - jnp.take_along_axis(path.x, k, 1), y_ - jnp.take_along_axis(path.y, k, 1)
+    s, d = k.astype(dx.dtype) * path.step + dx * cos + dy * sin, -dx * sin + dy * cos
     return s.reshape(x.shape), d.reshape(x.shape), heading.reshape(x.shape)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from limsim_jax.maps.lane_map import LaneMap, pose
 from limsim_jax.policies.perception import rules
-from limsim_jax.policies.reference import body_lane, place_on, way_ahead
+from limsim_jax.policies.reference import center_lane, reference_path, to_cartesian
 from limsim_jax.traffic.ego import Control, Trajectory
 from limsim_jax.traffic.engine import Command, Traffic
 from limsim_jax.traffic.motion import accelerations
@@ -101,14 +101,14 @@ class FollowLane:
         slot = state.egos.slot
         _, decision = rules(config, self.traffic, lane_map, state, jnp.zeros_like(slot))
         a = accelerations(self.traffic.model, state, decision, jnp.zeros_like(state.s))[slot][:, None]
-        lane, s = body_lane(lane_map, state, slot)
-        way = way_ahead(lane_map, lane, s, state.goal[slot], points=45, step=2.0)
+        lane, s = center_lane(lane_map, state, slot)
+        path = reference_path(lane_map, lane, s, state.goal[slot], points=45, step=2.0)
         times = 0.2 * jnp.arange(11, dtype=jnp.float32)[None]
         v0, d0 = state.v[slot][:, None], state.d[slot][:, None]
         stops = jnp.where(a < 0, v0 / jnp.maximum(-a, 1e-3), 1e3)
         t = jnp.minimum(times, stops)
         along = v0 * t + a * t * t / 2
-        place = place_on(way, along, d0 * jnp.exp(-along / 10.0))
+        place = to_cartesian(path, along, d0 * jnp.exp(-along / 10.0))
         trajectory = Trajectory(
             x=place.x, y=place.y, heading=place.heading, v=v0 + a * t, t0=config.time(state.step), dt=0.2
         )

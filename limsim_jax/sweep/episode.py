@@ -32,8 +32,8 @@ from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import NEAR_MISS, Rss
 from limsim_jax.metrics.traffic import NAMES as TRAFFIC_NAMES
 from limsim_jax.policies import POLICIES
-from limsim_jax.policies.base import Policy, made, variants
-from limsim_jax.policies.predict import Recalled, straight
+from limsim_jax.policies.base import Policy, build_policy, variants
+from limsim_jax.policies.predict import Replayed, constant_velocity
 from limsim_jax.simulation.rollout import Carry, Result, Rollout, Started, started
 from limsim_jax.simulation.totals import Totals
 from limsim_jax.simulation.trace import Trace, trace
@@ -285,12 +285,14 @@ class Episodes:
 
             run = self.rollout
             carry = decisions(run, first, world.carry)
-            other = variants(self._policy, Recalled(box, run.config.dt))[module]
+            other = variants(self._policy, Replayed(box, run.config.dt))[module]
             carry = carry._replace(memory=other.init(run.config, lane_map, carry.state))
             carry = decisions(replace(run, policy=other), more, carry)
             return EvaluateEgo().result(run.config, lane_map, carry.measured)
 
-        return {module: jax.jit(partial(advance, module)) for module in variants(self._policy, straight)}
+        return {
+            module: jax.jit(partial(advance, module)) for module in variants(self._policy, constant_velocity)
+        }
 
     def _modules_to_blame(self, seed: int, kind: str, start: float, end: float, seen: Trace) -> list[str]:
         """Modules of the policy whose references, in their places from `start` s on, avoid it until `end`."""
@@ -365,7 +367,7 @@ def _policy(experiment: ExperimentFile) -> Policy:
             f"{where}: unknown policy '{name}'; known are {', '.join(POLICIES)}, or module:factory"
         )
     try:
-        policy = made(factory, options)
+        policy = build_policy(factory, options)
     except (TypeError, ValueError) as error:
         raise ExperimentError(f"{experiment.name}: ego.options: {error}") from None
     if not isinstance(getattr(policy, "free", None), bool):

@@ -18,7 +18,7 @@ from limsim_jax.policies.limsim_tm.decide import corridor, grouped
 from limsim_jax.policies.limsim_tm.plan import room_needed
 from limsim_jax.policies.limsim_tm.search import Settings
 from limsim_jax.policies.pdm import PDMClosed
-from limsim_jax.policies.predict import constant_velocity, straight
+from limsim_jax.policies.predict import along_route, constant_velocity
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.simulation.rollout import Rollout, one_world
 from limsim_jax.simulation.trace import trace
@@ -117,7 +117,7 @@ def test_who_is_planned_for_knows_what_the_others_chose():
 
     def spied(lane_map, state, times, *, stop=None, plans=None):
         asked.append(plans)
-        return constant_velocity(lane_map, state, times, stop=stop, plans=plans)
+        return along_route(lane_map, state, times, stop=stop, plans=plans)
 
     config = Config(dt=0.1)
     policy = LimSimTM(search=None, predict=spied)
@@ -163,13 +163,13 @@ def test_a_change_that_can_wait_does_not_begin_shortly_before_a_junction():
 
 def test_each_module_has_a_reference():
     policy = LimSimTM(others=2, search_every=2)
-    found = variants(policy, straight)
+    found = variants(policy, constant_velocity)
     assert list(found) == ["prediction", "decision", "planning"]
-    assert found["prediction"] == replace(policy, predict=straight)
+    assert found["prediction"] == replace(policy, predict=constant_velocity)
     assert found["decision"] == replace(policy, search=None)
     assert found["planning"] == FollowLane(others=2)
-    mine = variants(AreaOfInterest(around=policy, slots=2), straight)["decision"]
+    mine = variants(AreaOfInterest(around=policy, slots=2), constant_velocity)["decision"]
     assert isinstance(mine, AreaOfInterest) and isinstance(mine.around, LimSimTM)
     assert mine.ego == LimSimTM(search=None, search_every=2) and mine.around.search is not None
-    assert list(variants(PDMClosed(), straight)) == ["prediction", "planning"]
-    assert variants(LikeTraffic(), straight) == {}
+    assert list(variants(PDMClosed(), constant_velocity)) == ["prediction", "planning"]
+    assert variants(LikeTraffic(), constant_velocity) == {}

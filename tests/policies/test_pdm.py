@@ -19,7 +19,7 @@ from limsim_jax.policies.pdm import proposals as pdm_proposals
 from limsim_jax.policies.pdm import road as pdm_road
 from limsim_jax.policies.pdm import score as pdm_score
 from limsim_jax.policies.pdm import tracker as pdm_tracker
-from limsim_jax.policies.reference import Way
+from limsim_jax.policies.reference import ReferencePath
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.trace import trace
 from limsim_jax.traffic.ego import Limits, from_lane, step_free, track, with_rows
@@ -49,12 +49,12 @@ def straight_road(limit=(14.0, 20.0), wall=1e6, d=(0.0, 0.4)) -> pdm_road.Road:
     m = 121
     line = jnp.broadcast_to(2.0 * jnp.arange(m, dtype=jnp.float32), (2, m))
     flat = jnp.zeros((2, m))
-    way = Way(
+    centerline = ReferencePath(
         x=line, y=flat, heading=flat, curvature=flat, limit=flat + jnp.array(limit)[:, None],
         left=flat + 5.25, right=flat + 1.75, lane=flat.astype(jnp.int32), end=jnp.full(2, 1e6), step=2.0,
     )  # fmt: skip
     return pdm_road.Road(
-        way=way, s=jnp.zeros(2), d=jnp.array(d), slope=jnp.zeros(2),
+        centerline=centerline, s=jnp.zeros(2), d=jnp.array(d), slope=jnp.zeros(2),
         offset=jnp.broadcast_to(jnp.array(pdm_road.OFFSETS), (2, 3)), wall=jnp.full((2, 3), wall),
         worth=jnp.zeros((2, 3)), half=flat + 1.75, oncoming=flat + 3.5, connector=flat > 0,
     )  # fmt: skip
@@ -129,12 +129,12 @@ def test_who_is_too_near_brakes_hard():
     me, road = body((1.5, 1.5), d=(0.0, 0.0)), straight_road(wall=95.0)
     rear = float(me.front[0]) + 1.0  # 1 m ahead stands somebody
     seen = others([rear + 2.25], [0.0], [0.0])
-    way = []
+    distance = []
     for strict in (False, True):
         found = pdm_proposals.idm(road, me, pdm_proposals.leaders(road, me, seen, pdm_road.STEPS), strict)
-        way.append(np.asarray(found.s)[0, :, -1].max())
+        distance.append(np.asarray(found.s)[0, :, -1].max())
     # with 6 m/s^2, in steps of 0.1 s: 0.15 + 0.09 + 0.03 m
-    assert way[0] == pytest.approx(0.27, abs=0.01) and way[1] > 0.4, way
+    assert distance[0] == pytest.approx(0.27, abs=0.01) and distance[1] > 0.4, distance
 
 
 def test_lqr_as_nuplan_writes_it():
@@ -201,14 +201,14 @@ def test_the_bicycle_is_that_which_drives_the_egos():
     turned = np.diff(motion.steering)
     assert np.abs(turned).max() == pytest.approx(0.04, abs=1e-5), "0.4 rad/s"
     assert np.abs(motion.steering).max() <= limits.steering + 1e-6
-    way = (motion.v[:-1] + motion.v[1:]) / 2 * 0.1
+    distance = (motion.v[:-1] + motion.v[1:]) / 2 * 0.1
     bend = np.tan((motion.steering[:-1] + motion.steering[1:]) / 2) / wheelbase
     most = 8.0 / motion.v[:-1] ** 2
     assert (np.abs(bend) > most).any() and (np.abs(bend) < most).any(), "the tyres slide now and then"
-    turn = way * np.clip(bend, -most, most)
+    turn = distance * np.clip(bend, -most, most)
     np.testing.assert_allclose(np.diff(motion.heading), turn, atol=1e-5)
     np.testing.assert_allclose(np.diff(motion.v), (motion.a[:-1] + motion.a[1:]) / 2 * 0.1, atol=1e-5)
-    np.testing.assert_allclose(np.hypot(np.diff(motion.x), np.diff(motion.y)), way, atol=1e-4)
+    np.testing.assert_allclose(np.hypot(np.diff(motion.x), np.diff(motion.y)), distance, atol=1e-4)
 
 
 def test_who_brakes_late_keeps_to_the_bend():
@@ -499,8 +499,10 @@ def test_emergency_brake():
     assert bool(plan.brakes[0]) and float(plan.scores.contact[0, int(plan.best[0])]) <= 2.0
     v = np.asarray(plan.trajectory.v)[0]
     np.testing.assert_allclose(v, np.maximum(4.9 - 7.0 * 0.1 * np.arange(41), 0), atol=1e-4)
-    way = np.hypot(plan.trajectory.x - plan.trajectory.x[:, :1], plan.trajectory.y - plan.trajectory.y[:, :1])
-    assert way[0, -1] == pytest.approx(4.9**2 / 14, abs=0.05)
+    distance = np.hypot(
+        plan.trajectory.x - plan.trajectory.x[:, :1], plan.trajectory.y - plan.trajectory.y[:, :1]
+    )
+    assert distance[0, -1] == pytest.approx(4.9**2 / 14, abs=0.05)
     assert not bool(planned("highway", behind(30.0, 4.9, 0.0)).brakes[0])
     assert bool(planned("highway", behind(1.2, 8.0, 0.0)).brakes[0])
     strict = planned("highway", behind(1.2, 8.0, 0.0), strict=True)

@@ -22,7 +22,7 @@ from limsim_jax.policies.limsim_tm.plan import (
     sample,
     speed_envelope,
 )
-from limsim_jax.policies.reference import Frenet, Way
+from limsim_jax.policies.reference import Frenet, ReferencePath
 from limsim_jax.traffic.car_following import ACC, NO_GAP
 
 POINTS, STEP = 80, 2.0
@@ -30,7 +30,7 @@ LATTICE = Lattice()
 K = 3
 
 
-def way(bends, limit=15.0):
+def path(bends, limit=15.0):
     """Arcs of one curvature each, from the origin to the east; roadways of unequal sides."""
     at = STEP * np.arange(POINTS)
     rows = {name: [] for name in ("x", "y", "heading", "curvature")}
@@ -45,7 +45,7 @@ def way(bends, limit=15.0):
     fields = {name: np.array(row) for name, row in rows.items()}
     fields |= {"limit": full * limit, "left": full * 5.0, "right": full * 1.9, "lane": full.astype(np.int32)}
     fields = {name: jnp.asarray(x, None if name == "lane" else jnp.float32) for name, x in fields.items()}
-    return Way(**fields, end=jnp.full(len(bends), 1e6), step=STEP)
+    return ReferencePath(**fields, end=jnp.full(len(bends), 1e6), step=STEP)
 
 
 def task(
@@ -66,7 +66,7 @@ def task(
         away, unit = jnp.full(shape, 1e4), jnp.ones((count, K))
         others = Others(away, away, jnp.zeros(shape), unit, unit, jnp.zeros((count, K), bool))
     return Task(
-        way=way(bends, limit), start=start, length=each(4.8), width=each(1.9), driver=drivers(count),
+        path=path(bends, limit), start=start, length=each(4.8), width=each(1.9), driver=drivers(count),
         lead_gap=each(lead[0])[:, None], lead_v=each(lead[1])[:, None],
         lead_a=each(lead[2] if len(lead) > 2 else 0.0)[:, None], wall=each(wall), other=others,
         merge=Merge(none, none, none, none > 0, zero),

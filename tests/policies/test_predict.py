@@ -11,12 +11,12 @@ from traffic_worlds import bundled, scattered
 from limsim_jax.maps.lane_map import width
 from limsim_jax.policies.predict import (
     Plans,
-    Recalled,
+    Replayed,
+    along_route,
     constant_velocity,
     hypotheses,
     nearest,
     shared,
-    straight,
 )
 from limsim_jax.traffic.ego import Trajectory
 from limsim_jax.traffic.motion import advance, boxes
@@ -53,7 +53,7 @@ def moved(lane_map, state):
     return jnp.concatenate([first, box])[::5], jnp.concatenate([state.active[None], active])[::5]
 
 
-predict = jax.jit(constant_velocity)
+predict = jax.jit(along_route)
 
 
 @pytest.mark.parametrize("name", ["highway", "intersection"])
@@ -77,7 +77,7 @@ def test_what_came_to_pass_is_recalled_from_where_vehicles_are_now():
     speeds = np.linspace(1.0, 12.0, N)
     box[:, :, 0] += 100.0 + t * speeds - 0.3 * t * t
     box[:, :, 2] += 0.02 * t
-    recall = Recalled(jnp.asarray(box, jnp.float32), 0.1)
+    recall = Replayed(jnp.asarray(box, jnp.float32), 0.1)
     at = 2.0  # s: the first run is known up to 8 s, so that the last of the times is past its end
     found = recall(lane_map, dataclasses.replace(state, step=jnp.int32(20)), TIMES + 3.0)
     later = np.minimum(at + np.asarray(TIMES) + 3.0, 8.0)
@@ -156,7 +156,7 @@ def test_what_is_shared_goes_on_from_where_the_vehicle_is():
 
 def test_straight_goes_along_the_heading():
     state, lane_map = world("roundabout", 1), bundled("roundabout")[1]
-    found, box = straight(lane_map, state, TIMES), np.asarray(boxes(lane_map, state))
+    found, box = constant_velocity(lane_map, state, TIMES), np.asarray(boxes(lane_map, state))
     t, v = np.asarray(TIMES)[None], np.asarray(state.v)[:, None]
     np.testing.assert_allclose(found.x, box[:, :1] + v * t * np.cos(box[:, 2:3]), atol=1e-3)
     np.testing.assert_allclose(found.y, box[:, 1:2] + v * t * np.sin(box[:, 2:3]), atol=1e-3)

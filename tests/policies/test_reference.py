@@ -8,7 +8,14 @@ import numpy as np
 from traffic_worlds import bundled, scattered
 
 from limsim_jax.maps.lane_map import NO_LANE, pose, side_s, width
-from limsim_jax.policies.reference import Way, beside, body_lane, motion_on, place_on, way_ahead
+from limsim_jax.policies.reference import (
+    ReferencePath,
+    beside,
+    center_lane,
+    motion_on,
+    reference_path,
+    to_cartesian,
+)
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.motion import advance, boxes
 from limsim_jax.types import Config
@@ -36,34 +43,34 @@ def walk(lane_map, lane, s, goal, after=NO_LANE):
 def ways(name, seed, **more):
     state, lane_map = scattered(name, N, seed), bundled(name)[1]
     slot = jnp.arange(N)
-    lane, s = body_lane(lane_map, state, slot)
-    way = jax.jit(lambda: way_ahead(lane_map, lane, s, state.goal, points=POINTS, step=STEP, **more))()
-    return lane_map, state, lane, s, way
+    lane, s = center_lane(lane_map, state, slot)
+    path = jax.jit(lambda: reference_path(lane_map, lane, s, state.goal, points=POINTS, step=STEP, **more))()
+    return lane_map, state, lane, s, path
 
 
 def test_points_are_those_of_a_walk_along_the_lanes():
     for name in ("roundabout", "intersection"):
-        lane_map, state, lane, s, way = ways(name, 5)
+        lane_map, state, lane, s, path = ways(name, 5)
         ends = 0
         for i in range(N):
             places, end = walk(lane_map, int(lane[i]), float(s[i]), int(state.goal[i]))
             rows, at = jnp.array([row for row, _ in places]), jnp.array([at for _, at in places])
             x, y, heading = pose(lane_map, rows, at)
-            np.testing.assert_array_equal(way.lane[i], rows)
-            np.testing.assert_allclose(way.x[i], x, atol=1e-3)
-            np.testing.assert_allclose(way.y[i], y, atol=1e-3)
-            turned = np.remainder(np.asarray(way.heading[i] - heading) + np.pi, 2 * np.pi) - np.pi
+            np.testing.assert_array_equal(path.lane[i], rows)
+            np.testing.assert_allclose(path.x[i], x, atol=1e-3)
+            np.testing.assert_allclose(path.y[i], y, atol=1e-3)
+            turned = np.remainder(np.asarray(path.heading[i] - heading) + np.pi, 2 * np.pi) - np.pi
             np.testing.assert_allclose(turned, 0, atol=1e-4)
-            if end is not None and end < way.reach:
+            if end is not None and end < path.reach:
                 ends += 1
-                np.testing.assert_allclose(way.end[i], end, atol=1e-3)
+                np.testing.assert_allclose(path.end[i], end, atol=1e-3)
             half = np.asarray(width(lane_map, rows, at)) / 2
-            for side, edge, neighbour in ((1, way.left, lane_map.left), (-1, way.right, lane_map.right)):
+            for side, edge, neighbour in ((1, path.left, lane_map.left), (-1, path.right, lane_map.right)):
                 other = neighbour[rows]
                 level = side_s(lane_map, rows, at, jnp.full_like(rows, side))
                 more = np.where(other == NO_LANE, 0, width(lane_map, other, level))
                 np.testing.assert_allclose(edge[i], half + more, atol=1e-4)
-        assert np.abs(np.diff(way.heading, axis=1)).max() < 1.0, "no jumps of a whole turn"
+        assert np.abs(np.diff(path.heading, axis=1)).max() < 1.0, "no jumps of a whole turn"
         assert ends > 0
 
 
@@ -78,18 +85,18 @@ def test_the_lane_that_the_front_is_on_counts():
     )  # fmt: skip
     other = next(int(k) for k in successors[lane] if k >= 0 and k != int(routes.next_lane[lane, goal]))
     place = jnp.array([lane]), lane_map.length[lane][None] - 3.0, jnp.array([goal])
-    by_route = way_ahead(lane_map, *place, points=POINTS, step=STEP)
-    known = way_ahead(lane_map, *place, points=POINTS, step=STEP, after=jnp.array([other]))
+    by_route = reference_path(lane_map, *place, points=POINTS, step=STEP)
+    known = reference_path(lane_map, *place, points=POINTS, step=STEP, after=jnp.array([other]))
     assert int(by_route.lane[0, 2]) == int(routes.next_lane[lane, goal])
     places, _ = walk(lane_map, lane, float(place[1][0]), goal, other)
     np.testing.assert_array_equal(known.lane[0], [row for row, _ in places])
 
 
 def test_places_lie_on_the_lanes():
-    lane_map, state, lane, s, way = ways("roundabout", 5)
+    lane_map, state, lane, s, path = ways("roundabout", 5)
     at = jnp.broadcast_to(STEP * jnp.arange(POINTS - 1.0) + 0.7, (N, POINTS - 1))
     d = jnp.linspace(-1.5, 2.0, N)[:, None]
-    found = jax.jit(place_on)(way, at, d)
+    found = jax.jit(to_cartesian)(path, at, d)
     for i in range(N):
         places, end = walk(lane_map, int(lane[i]), float(s[i]), int(state.goal[i]))
         rows = np.array([row for row, _ in places])
@@ -100,7 +107,7 @@ def test_places_lie_on_the_lanes():
         off = np.hypot(found.x[i] - x, found.y[i] - y)
         turned = np.remainder(np.asarray(found.heading[i] - heading) + np.pi, 2 * np.pi) - np.pi
         assert off[inner].max() < 0.05 and np.abs(turned[inner]).max() < 0.05
-    ends = place_on(way, jnp.array([[-5.0, 0.0, way.reach, way.reach + 7.0]] * N), jnp.zeros((N, 1)))
+    ends = to_cartesian(path, jnp.array([[-5.0, 0.0, path.reach, path.reach + 7.0]] * N), jnp.zeros((N, 1)))
     for k, apart in ((1, 5.0), (3, 7.0)):
         np.testing.assert_allclose(
             np.hypot(ends.x[:, k] - ends.x[:, k - 1], ends.y[:, k] - ends.y[:, k - 1]), apart, atol=1e-3
@@ -140,9 +147,9 @@ def test_motion_across_is_that_of_the_lane_change():
     first, _, _ = advance(tick, lane_map, state, zero)
     second, dx, _ = advance(tick, lane_map, first, zero)
     slot = jnp.arange(N)
-    lane, s = body_lane(lane_map, first, slot)
-    way = way_ahead(lane_map, lane, s, first.goal, points=POINTS, step=STEP)
-    found = motion_on(way, first, slot, first.d)
+    lane, s = center_lane(lane_map, first, slot)
+    path = reference_path(lane_map, lane, s, first.goal, points=POINTS, step=STEP)
+    found = motion_on(path, first, slot, first.d)
     np.testing.assert_allclose(found.d_v, (second.d - first.d) / tick.dt, atol=0.06)
     np.testing.assert_allclose(found.slope, (second.d - first.d) / dx, atol=5e-3)
     np.testing.assert_allclose(found.v, first.v, rtol=0.02)
@@ -155,9 +162,9 @@ def test_motion_of_free_egos_is_that_of_their_heading():
     egos = dataclasses.replace(egos, heading=egos.heading + jnp.array([0.1, -0.05]), steering=jnp.zeros(2))
     state = dataclasses.replace(state, egos=egos)
     slot = jnp.array([7, 3, 0])
-    lane, s = body_lane(lane_map, state, slot)
-    way = way_ahead(lane_map, lane, s, state.goal[slot], points=POINTS, step=STEP)
-    found = motion_on(way, state, slot, jnp.zeros(3))
+    lane, s = center_lane(lane_map, state, slot)
+    path = reference_path(lane_map, lane, s, state.goal[slot], points=POINTS, step=STEP)
+    found = motion_on(path, state, slot, jnp.zeros(3))
     v = np.asarray(state.v)[[7, 3, 0]]
     np.testing.assert_allclose(found.slope, [np.tan(-0.05), np.tan(0.1), 0], atol=2e-3)
     np.testing.assert_allclose(found.d_v, v * np.sin([-0.05, 0.1, 0]), atol=0.05)
@@ -167,5 +174,5 @@ def test_motion_of_free_egos_is_that_of_their_heading():
 def test_no_lane_gives_a_harmless_way():
     lane_map = bundled("highway")[1]
     nobody = jnp.array([NO_LANE])
-    way = way_ahead(lane_map, nobody, jnp.zeros(1), jnp.zeros(1, jnp.int32), points=POINTS, step=STEP)
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(way)) and isinstance(way, Way)
+    path = reference_path(lane_map, nobody, jnp.zeros(1), jnp.zeros(1, jnp.int32), points=POINTS, step=STEP)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(path)) and isinstance(path, ReferencePath)

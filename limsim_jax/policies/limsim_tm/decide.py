@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, width
 from limsim_jax.policies.limsim_tm import group, search
 from limsim_jax.policies.predict import Prediction
-from limsim_jax.policies.reference import Way, nearest_on
+from limsim_jax.policies.reference import ReferencePath, project_onto
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.types import State
 
@@ -26,10 +26,10 @@ LANES = 5
 
 _MIDDLE = LANES // 2
 _NEAR = 60.0  # m, within which somebody who is not planned for may be taken into a group
-_FAR_AWAY = 1e3  # m off the way: of no interest
+_FAR_AWAY = 1e3  # m off the path: of no interest
 
 
-class Told(NamedTuple):
+class Maneuvers(NamedTuple):
     """What `V` vehicles are to do until the next search."""
 
     side: Int[Array, " V"]  # +1: change to the left, -1: to the right, 0: stay
@@ -134,21 +134,21 @@ def scene(
     lane_map: LaneMap,
     state: State,
     member: Int[Array, " G"],
-    way: Way,
+    path: ReferencePath,
     near: Int[Array, " K"],
     prediction: Prediction,
     lane: Int[Array, " N"],
     side: Int[Array, " N"],
     wall: Float[Array, " N"],
 ) -> search.Scene:
-    """The corridor of one group, along the way `[1 M]` of its first member.
+    """The corridor of one group, along the path `[1 M]` of its first member.
 
     `prediction` is at the moments of the search; `lane`: of the centres of all bodies; `side`: lane changes
     under way; `wall`: m to where each must stop.
     """
     everybody = jnp.concatenate([member, jnp.where((near[:, None] == member[None]).any(-1), -1, near)])
     x, y = prediction.x[everybody], prediction.y[everybody]  # [G+K H]
-    s, d, along = (found[0] for found in nearest_on(way, x[None], y[None]))
+    s, d, along = (found[0] for found in project_onto(path, x[None], y[None]))
     turned = jnp.cos(prediction.heading[everybody] - along)
     s = s + state.shape.length[everybody][:, None] / 2  # fronts
     count = member.shape[0]
@@ -164,7 +164,7 @@ def scene(
     stop = jnp.where(wall[member] < NO_GAP / 2, s[:count, 0] + wall[member], NO_GAP)
     mine = at[:, None] == jnp.arange(LANES)[None]
     others = everybody[count:]
-    away = (turned[count:] < 0.3) | (jnp.abs(s[count:]) > way.reach)
+    away = (turned[count:] < 0.3) | (jnp.abs(s[count:]) > path.reach)
     lanes = lambda low, value: jnp.clip(at + value, low, LANES - 1)  # noqa: E731
     return search.Scene(
         active=active,
@@ -194,13 +194,13 @@ def scene(
     )
 
 
-def tell(
+def decide_maneuvers(
     settings: search.Settings,
     lane_map: LaneMap,
     state: State,
     slot: Int[Array, " V"],
     members: Int[Array, "V G"],
-    way: Way,
+    path: ReferencePath,
     near: Int[Array, "V K"],
     prediction: Prediction,
     lane: Int[Array, " N"],
@@ -208,13 +208,13 @@ def tell(
     wall: Float[Array, " N"],
     previous: Int[Array, "V D"],
     key: Key[Array, ""],
-) -> Told:
+) -> Maneuvers:
     """Search in all groups, and what that means for the planned vehicles in `slot`."""
     row_of = lambda which: jnp.argmax(slot[None] == which[:, None], -1)  # noqa: E731
     first = row_of(members[:, 0])
 
     def one(member: Array, row: Array, key: Key[Array, ""]) -> tuple[search.Plan, Array]:
-        mine = jax.tree.map(lambda value: value[row][None], way)
+        mine = jax.tree.map(lambda value: value[row][None], path)
         found = scene(lane_map, state, member, mine, near[row], prediction, lane, side, wall)
         known = (slot[None] == member[:, None]).any(-1) & (member >= 0)
         before = jnp.where(
@@ -231,7 +231,7 @@ def tell(
     pick = lambda value: value.reshape(-1, *value.shape[2:])[place]  # noqa: E731
     soon = settings.substeps
     turn = jnp.round(pick(plans.aim)[:, soon]).astype(jnp.int32) - pick(lanes)
-    return Told(
+    return Maneuvers(
         side=jnp.where(found & ~pick(plans.crashed), jnp.clip(turn, -1, 1), 0),
         v=pick(plans.v),
         action=pick(plans.action),

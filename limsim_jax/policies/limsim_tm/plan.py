@@ -1,6 +1,6 @@
-"""Trajectories along a way: a lattice of speeds, horizons and offsets, of which the cheapest is taken.
+"""Trajectories along a path: a lattice of speeds, horizons and offsets, of which the cheapest is taken.
 
-Werling, Ziegler, Kammel, Thrun (ICRA 2010): quartics and quintics in time along the way; across it
+Werling, Ziegler, Kammel, Thrun (ICRA 2010): quartics and quintics in time along the path; across it
 quintics over the distance driven, so that also slow vehicles can follow them. Among the samples are always
 car following with several desired speeds, and braking, mild and as hard as possible: some trajectory is
 drivable in any case.
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.policies.reference import Frenet, Place, Way, place_on
+from limsim_jax.policies.reference import Frenet, Place, ReferencePath, to_cartesian
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
 from limsim_jax.types import Driver
 from limsim_jax.xla import computed_once, interval, mapped_like
@@ -25,7 +25,7 @@ from limsim_jax.xla import computed_once, interval, mapped_like
 class Task(NamedTuple):
     """What `V` vehicles have ahead of them."""
 
-    way: Way  # the one to follow: of the own lane or of the one to change to
+    path: ReferencePath  # the one to follow: of the own lane or of the one to change to
     start: Frenet
     length: Float[Array, " V"]  # m
     width: Float[Array, " V"]
@@ -55,7 +55,7 @@ class Others(NamedTuple):
 class Merge(NamedTuple):
     """Traffic on the lane that the route needs next, to which the vehicle adapts its speed."""
 
-    s: Float[Array, "V K"]  # m from centre to centre along the way, now
+    s: Float[Array, "V K"]  # m from centre to centre along the path, now
     v: Float[Array, "V K"]  # m/s
     length: Float[Array, "V K"]  # m
     there: Bool[Array, "V K"]
@@ -101,7 +101,7 @@ class Lattice:
         to it from a standstill.
       following: desired speeds of the car-following samples, as shares.
       braking: m/s^2, constant; the hardest is the driver's `b_max`.
-      offsets: m off the middle of the way at the end.
+      offsets: m off the middle of the path at the end.
       distances: over which each of them is reached, as a share of the usual distance.
       lateral_time: s for a change of offset, at driving speed.
     """
@@ -197,16 +197,16 @@ def quintic(
 
 
 def speed_envelope(task: Task) -> Float[Array, "V M"]:
-    """Fastest speed at every point of the way, m/s, from which all that comes is met by braking mildly.
+    """Fastest speed at every points of the path, m/s, from which all that comes is met by braking mildly.
 
     Speed limits, bends and the wall.
     """
-    way, driver = task.way, task.driver
-    fastest = jnp.minimum(driver.speed_factor[:, None] * way.limit, driver.v_max[:, None])
-    bend = jnp.sqrt(driver.a_lat[:, None] / jnp.maximum(jnp.abs(way.curvature), 1e-5))
+    path, driver = task.path, task.driver
+    fastest = jnp.minimum(driver.speed_factor[:, None] * path.limit, driver.v_max[:, None])
+    bend = jnp.sqrt(driver.a_lat[:, None] / jnp.maximum(jnp.abs(path.curvature), 1e-5))
     top = jnp.minimum(fastest, bend)
     b = 2 * _APPROACH * driver.b[:, None]
-    at = way.step * jnp.arange(way.x.shape[-1], dtype=top.dtype)[None]
+    at = path.step * jnp.arange(path.x.shape[-1], dtype=top.dtype)[None]
     square = lax.cummin(top * top + b * at, axis=1, reverse=True) - b * at
     room = jnp.maximum(task.wall[:, None] - at, 0)
     return jnp.sqrt(jnp.maximum(jnp.minimum(square, 2 * _stopping(task)[:, None] * room), 0))
@@ -233,7 +233,7 @@ def leaders(task: Task, t: Float[Array, "*#b"]) -> tuple[Float[Array, "*b J"], F
 def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
     """All samples of the lattice for every vehicle, with their costs: each motion along with each offset.
 
-    What depends on the motion along the way alone is worked out once for all offsets.
+    What depends on the motion along the path alone is worked out once for all offsets.
     """
     envelope = speed_envelope(task)
     s, v, a, jerk = _along(lattice, model, task, envelope)  # [V A H]
@@ -246,10 +246,10 @@ def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
     d, slope, bend, _ = quintic(
         d0, slope0, first[:, None], goal[:, None], 0.0, 0.0, end[:, None], s[:, :, None]
     )  # [V A O H]
-    place = Place(*(x[:, :, None] for x in place_on(task.way, s, jnp.zeros_like(s))))
+    place = Place(*(x[:, :, None] for x in to_cartesian(task.path, s, jnp.zeros_like(s))))
     stretch = jnp.maximum(1 - place.curvature * d, 0.2)
     skew = slope / stretch
-    turned = lax.rsqrt(1 + skew * skew)  # cosine of the angle to the way
+    turned = lax.rsqrt(1 + skew * skew)  # cosine of the angle to the path
     cos_way, sin_way = jnp.cos(place.heading), jnp.sin(place.heading)
     x, y = place.x - d * sin_way, place.y + d * cos_way
     cos, sin = turned * (cos_way - skew * sin_way), turned * (sin_way + skew * cos_way)
@@ -274,14 +274,14 @@ def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
 
 
 def _first_bend(task: Task, goal: Array, end: Array) -> Float[Array, "V O 1"]:
-    """Second derivative, 1/m, with which samples begin that are `goal` off the way after `end`, m.
+    """Second derivative, 1/m, with which samples begin that are `goal` off the path after `end`, m.
 
     That of the present motion. Who stands can turn the wheels first: like a cubic, as far as they turn.
     """
     d, slope, bend, here, v, most = (
         x[:, None, None]
         for x in (
-            task.start.d, task.start.slope, task.start.bend, task.way.curvature[:, 0], task.start.v,
+            task.start.d, task.start.slope, task.start.bend, task.path.curvature[:, 0], task.start.v,
             _tightest(task),
         )
     )  # fmt: skip
@@ -315,13 +315,13 @@ def plan(lattice: Lattice, model: CarFollowing, task: Task) -> Plan:
 
 def _fastest(task: Task, envelope: Float[Array, "V M"]) -> Float[Array, " V"]:
     """The highest speed that is allowed anywhere on the next stretch, m/s."""
-    return jnp.max(envelope[:, : max(2, int(_STRETCH / task.way.step))], -1)
+    return jnp.max(envelope[:, : max(2, int(_STRETCH / task.path.step))], -1)
 
 
 def _along(
     lattice: Lattice, model: CarFollowing, task: Task, envelope: Float[Array, "V M"]
 ) -> tuple[Array, Array, Array, Array]:
-    """Motion along the way `[V A H]`: m, m/s, m/s^2, m/s^3."""
+    """Motion along the path `[V A H]`: m, m/s, m/s^2, m/s^3."""
     start, t = task.start, lattice.times()[None, None]
     v0, a0 = start.v[:, None, None], jnp.clip(start.a, -8.0, 4.0)[:, None, None]
     # end speeds from a standstill to the fastest that is allowed where it would be then
@@ -382,7 +382,7 @@ def _follow(
     lattice: Lattice, model: CarFollowing, task: Task, envelope: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Car following behind all leaders and before the wall, with several shares of the desired speed."""
-    start, way, dt = task.start, task.way, lattice.dt
+    start, path, dt = task.start, task.path, lattice.dt
     driver = jax.tree.map(lambda x: x[:, None, None], task.driver)
     share = jnp.asarray(lattice.following, start.v.dtype)[None]
     v = jnp.broadcast_to(start.v[:, None], (start.v.shape[0], share.shape[1]))
@@ -392,7 +392,7 @@ def _follow(
 
     def step(carry: tuple[Array, ...], t: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         s, v, a = carry
-        k = jnp.clip((s / way.step).astype(jnp.int32), 0, way.x.shape[-1] - 1)
+        k = jnp.clip((s / path.step).astype(jnp.int32), 0, path.x.shape[-1] - 1)
         v0 = share * jnp.take_along_axis(envelope, k, 1)
         far, lead_v = leaders(task, jnp.broadcast_to(t, (1, 1)))
         far, lead_v = jnp.concatenate([far, wall], -1), jnp.concatenate([lead_v, jnp.zeros_like(wall)], -1)
@@ -414,11 +414,11 @@ def _follow(
 def _costs_along(
     lattice: Lattice, task: Task, envelope: Array, s: Array, v: Array, a: Array, jerk: Array
 ) -> tuple[Float[Array, "V A"], Float[Array, "V A"], tuple[Float[Array, "V A H"], Float[Array, "V A H"]]]:
-    """Cost of every motion along the way, by how much it breaks bounds, and the room left and right, m."""
-    way, driver, t = task.way, task.driver, lattice.times()[None, None]
+    """Cost of every motion along the path, by how much it breaks bounds, and the room left and right, m."""
+    path, driver, t = task.path, task.driver, lattice.times()[None, None]
     each = lambda value: value[:, None, None]  # noqa: E731
     flat = (s.shape[0], -1)
-    k, u = interval(s.reshape(flat) / way.step, way.x.shape[-1] - 1)
+    k, u = interval(s.reshape(flat) / path.step, path.x.shape[-1] - 1)
 
     def along(table: Float[Array, "V M"]) -> Array:
         low, high = jnp.take_along_axis(table, k, 1), jnp.take_along_axis(table, k + 1, 1)
@@ -459,7 +459,7 @@ def _costs_along(
     rss = jnp.where(t <= _RSS_UNTIL, jnp.maximum(jnp.maximum(need, 0.5) - gap, 0).max(-1), 0)
     acceleration = jnp.maximum(a - 4.0, 0) + jnp.maximum(-a - each(driver.b_max) - 0.5, 0)
     broken = 0.5 * jnp.max(beyond, -1) + 0.1 * jnp.max(rss, -1) + jnp.max(acceleration, -1)
-    return cost, broken, (along(way.left), along(way.right))
+    return cost, broken, (along(path.left), along(path.right))
 
 
 def _costs_across(

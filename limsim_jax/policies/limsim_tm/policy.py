@@ -13,12 +13,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, neighbor
 from limsim_jax.policies.base import Policy
-from limsim_jax.policies.limsim_tm.decide import Told, grouped, neighbours, tell
+from limsim_jax.policies.limsim_tm.decide import Maneuvers, decide_maneuvers, grouped, neighbours
 from limsim_jax.policies.limsim_tm.plan import Lattice, Merge, Others, Task, plan, room_needed
 from limsim_jax.policies.limsim_tm.search import Settings, no_plan, shifted
 from limsim_jax.policies.perception import Around, around, rules
-from limsim_jax.policies.predict import Prediction, Predictor, constant_velocity, shared
-from limsim_jax.policies.reference import Way, beside, body_lane, motion_on, way_ahead
+from limsim_jax.policies.predict import Prediction, Predictor, along_route, shared
+from limsim_jax.policies.reference import ReferencePath, beside, center_lane, motion_on, reference_path
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.ego import Trajectory, at_slots
@@ -34,7 +34,7 @@ class Memory(NamedTuple):
 
     slot: Int[Array, " E"]  # whose it is
     side: Int[Array, " E"]  # lane change under way: 1 left, -1 right, 0 none
-    told: Told  # by the last search
+    maneuvers: Maneuvers  # by the last search
     since: Float[Array, " E"]  # s, time of that search
     plan: Trajectory | None  # of each of them, for the others to know
 
@@ -60,7 +60,7 @@ class LimSimTM:
     search: Settings | None = field(default_factory=lambda: Settings(simulations=40, change=0.08))
     search_every: int = 3
     obedience: float = 0.985
-    predict: Predictor = constant_velocity
+    predict: Predictor = along_route
     shares: bool = True
     lattice: Lattice = field(default_factory=Lattice)
     traffic: Traffic = field(default_factory=Traffic)
@@ -80,7 +80,7 @@ class LimSimTM:
         del lane_map
         rows = state.egos.slot.shape[0]
         size = Settings() if self.search is None else self.search
-        told = Told(
+        maneuvers = Maneuvers(
             side=jnp.zeros(rows, jnp.int32),
             v=jnp.full((rows, size.steps + 1), _ANY_SPEED),
             action=no_plan(rows, size.decisions),
@@ -91,7 +91,7 @@ class LimSimTM:
             t0=config.time(state.step), dt=self.lattice.dt,
         )  # fmt: skip
         return Memory(
-            state.egos.slot, jnp.zeros_like(state.egos.slot), told, jnp.full(rows, -1e3),
+            state.egos.slot, jnp.zeros_like(state.egos.slot), maneuvers, jnp.full(rows, -1e3),
             plan if self.shares and rows > 1 else None,
         )  # fmt: skip
 
@@ -105,7 +105,7 @@ class LimSimTM:
         side = jnp.where(same, memory.side, 0)
         rule, decision = rules(config, self.traffic, lane_map, state, side)
         wish = rule
-        lane, s = body_lane(lane_map, state, slot)
+        lane, s = center_lane(lane_map, state, slot)
         d, goal = state.d[slot], state.goal[slot]
 
         wall = decision.obstacles.gap[:, -1] - state.driver.s0
@@ -118,17 +118,17 @@ class LimSimTM:
             return self.predict(lane_map, state, times, stop=wall, plans=known)
 
         prediction = predict(self.lattice.times())
-        own = way_ahead(lane_map, lane, s, goal, points=_POINTS, step=_STEP)
+        own = reference_path(lane_map, lane, s, goal, points=_POINTS, step=_STEP)
         nearby = around(state, prediction, own, slot, self.nearest)
 
-        told, since = memory.told, jnp.where(same, memory.since, -1e3)
+        maneuvers, since = memory.maneuvers, jnp.where(same, memory.since, -1e3)
         if self.search is not None:
             due = (state.step // config.decision_every) % self.search_every == 0
-            told = self._search(
-                lane_map, state, drives, lane, side, wish, own, nearby, wall, predict, told, due, key
+            maneuvers = self._search(
+                lane_map, state, drives, lane, side, wish, own, nearby, wall, predict, maneuvers, due, key
             )
             since = jnp.where(due, now, since)
-            wish = jnp.where(now - since < 1e2, told.side, wish)
+            wish = jnp.where(now - since < 1e2, maneuvers.side, wish)
 
         # go on with a lane change until the middle of the body is on the other lane, as long as it is safe
         side = jnp.where(side.astype(d.dtype) * d < -0.3, 0, side)
@@ -141,7 +141,7 @@ class LimSimTM:
         wish = jnp.where((wish * need < 0) & (press > 0.3), 0, wish)
         look = jnp.where(side != 0, side, jnp.where(wish != 0, wish, jnp.sign(need)))
         other_lane, other_s, other_d, there = beside(lane_map, lane, s, d, look)
-        target = way_ahead(lane_map, other_lane, other_s, goal, points=_POINTS, step=_STEP)
+        target = reference_path(lane_map, other_lane, other_s, goal, points=_POINTS, step=_STEP)
         traffic = around(state, prediction, target, slot, self.nearest)
         begins = (side == 0) & (jnp.abs(d) < 0.6) & self._may_change(lane_map, state, slot, lane, look)
         # changes to the left and to the right begin in turns, as in all traffic
@@ -151,7 +151,7 @@ class LimSimTM:
         begins &= ((wish == look) | (need * look > 0)) & fits | ((rule == look) & (need * rule > 0))
         # what can wait does not begin shortly before a junction: it would stand between two lanes there
         v = jnp.maximum(state.v[slot], CREEP_SPEED)
-        inside = lane_map.is_connector[own.lane]  # along the way: roads may be in pieces before it
+        inside = lane_map.is_connector[own.lane]  # along the path: roads may be in pieces before it
         junction = jnp.where(inside.any(-1), _STEP * jnp.argmax(inside, -1).astype(s.dtype), jnp.inf)
         near = junction <= v * state.driver.lane_change_time[slot] + _BEFORE_JUNCTION
         begins &= ~near | ((need * look > 0) & (room <= junction + _STEP))
@@ -162,37 +162,36 @@ class LimSimTM:
         def choose(a: Array, b: Array) -> Array:
             return jnp.where(changes.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
 
-        way, found = jax.tree.map(choose, (target, traffic), (own, nearby))
+        path, found = jax.tree.map(choose, (target, traffic), (own, nearby))
         d = jnp.where(changes, other_d, d)
         merge = Merge(
             traffic.s, traffic.v, state.shape.length[traffic.slot], traffic.there & traffic.on_way,
             jnp.where(there & (look * need > 0) & ~changes, jnp.clip(press, 0.2, 1.0), 0.0),
         )  # fmt: skip
-        task = self._task(
-            state, decision, way, slot, d, found, prediction, wall, merge, self._speed(told, now - since)
-        )
+        wanted = self._speed(maneuvers, now - since)
+        task = self._task(state, decision, path, slot, d, found, prediction, wall, merge, wanted)
         chosen = plan(self.lattice, self.traffic.model, task)
         trajectory = Trajectory(
             x=chosen.x, y=chosen.y, heading=chosen.heading, v=chosen.v,
             t0=now, dt=self.lattice.dt,
         )  # fmt: skip
-        memory = Memory(slot, side, told, since, None if memory.plan is None else trajectory)
+        memory = Memory(slot, side, maneuvers, since, None if memory.plan is None else trajectory)
         return Command(trajectory=trajectory, signal=side), memory
 
     def _search(
-        self, lane_map: LaneMap, state: State, drives: Array, lane: Array, side: Array, wish: Array, own: Way,
-        nearby: Around, wall: Array, predict: Callable[[Array], Prediction], told: Told, due: Array,
-        key: jax.Array,
-    ) -> Told:  # fmt: skip
-        """What the search tells all planned vehicles, if it is `due`; else what it told them before.
+        self, lane_map: LaneMap, state: State, drives: Array, lane: Array, side: Array, wish: Array,
+        own: ReferencePath, nearby: Around, wall: Array, predict: Callable[[Array], Prediction],
+        maneuvers: Maneuvers, due: Array, key: jax.Array,
+    ) -> Maneuvers:  # fmt: skip
+        """What the search tells all planned vehicles, if it is `due`; otherwise the maneuvers of before.
 
         A loop of at most one pass: where no world of a batch is due, it costs nothing.
         """
         settings, slot = self.search, state.egos.slot
         if settings is None:
-            return told
+            return maneuvers
 
-        def look(carry: tuple[Array, Told]) -> tuple[Array, Told]:
+        def look(carry: tuple[Array, Maneuvers]) -> tuple[Array, Maneuvers]:
             times = settings.dt * jnp.arange(settings.steps + 1, dtype=jnp.float32)
             prediction = predict(times)
             counts = neighbours(nearby.gap, nearby.d, nearby.there)
@@ -200,15 +199,15 @@ class LimSimTM:
                 lane_map, state, slot, drives, lane, jnp.where(side != 0, side, wish),
                 prediction.x[:, 0], prediction.y[:, 0], nearby.slot, counts,
             )  # fmt: skip
-            bodies, _ = body_lane(lane_map, state, jnp.arange(state.lane.shape[0]))
+            bodies, _ = center_lane(lane_map, state, jnp.arange(state.lane.shape[0]))
             sides = at_slots(state.egos, side, state.side)
-            new = tell(
+            new = decide_maneuvers(
                 settings, lane_map, state, slot, members, own, nearby.slot, prediction, bodies, sides, wall,
                 shifted(carry[1].action), key,
             )  # fmt: skip
             return jnp.zeros_like(carry[0]), new
 
-        return lax.while_loop(lambda carry: carry[0], look, (due, told))[1]
+        return lax.while_loop(lambda carry: carry[0], look, (due, maneuvers))[1]
 
     def _may_change(
         self, lane_map: LaneMap, state: State, slot: Array, lane: Array, side: Int[Array, " V"]
@@ -232,13 +231,13 @@ class LimSimTM:
         fewer = count < jnp.abs(routes.lanes_to_go[lane, goal]).astype(s.dtype)
         return there & ((count == 0) | fewer | back)
 
-    def _speed(self, told: Told, late: Float[Array, " V"]) -> Float[Array, "V H"]:
+    def _speed(self, maneuvers: Maneuvers, late: Float[Array, " V"]) -> Float[Array, "V H"]:
         """Speeds that the search had in mind, at the moments of the plan, m/s."""
         if self.search is None:
             return jnp.full((late.shape[0], self.lattice.moments), _ANY_SPEED)
         at = (late[:, None] + self.lattice.times()[None]) / self.search.dt
-        k, u = interval(at, told.v.shape[1] - 1)
-        low, high = jnp.take_along_axis(told.v, k, 1), jnp.take_along_axis(told.v, k + 1, 1)
+        k, u = interval(at, maneuvers.v.shape[1] - 1)
+        low, high = jnp.take_along_axis(maneuvers.v, k, 1), jnp.take_along_axis(maneuvers.v, k + 1, 1)
         v = low + jnp.clip(u, 0, 1) * (high - low)
         return jnp.where(late[:, None] < 1e2, v, _ANY_SPEED)
 
@@ -250,7 +249,7 @@ class LimSimTM:
         most: Float[Array, " V"] | float,
         headway: Float[Array, " V"] | float = 0.3,
     ) -> Bool[Array, " V"]:
-        """Whether there is room on the way: nobody beside, nobody has to brake harder than `most` m/s^2."""
+        """Whether there is room on the path: nobody beside, nobody has to brake harder than `most` m/s^2."""
         most, headway = (
             jnp.broadcast_to(jnp.asarray(x, found.v.dtype), slot.shape)[:, None] for x in (most, headway)
         )
@@ -263,7 +262,7 @@ class LimSimTM:
         self,
         state: State,
         decision: Decision,
-        way: Way,
+        path: ReferencePath,
         slot: Array,
         d: Array,
         found: Around,
@@ -291,8 +290,8 @@ class LimSimTM:
         leader = jnp.concatenate([index, jnp.take_along_axis(found.slot, nearest, 1)], -1)
         follows = found.on_way & (found.s <= 0)
         return Task(
-            way=way,
-            start=motion_on(way, state, slot, d),
+            path=path,
+            start=motion_on(path, state, slot, d),
             length=state.shape.length[slot],
             width=state.shape.width[slot],
             driver=driver,

@@ -329,11 +329,11 @@ def _drive(
     dt, width = settings.dt, scene.lane_width
     a = _accelerate(pairs, scene, motion, now)
     a = jnp.where(scene.active, jnp.minimum(a, cap), 0)
-    v, way = ballistic(motion.v, a, dt)
+    v, distance = ballistic(motion.v, a, dt)
     a = (v - motion.v) / dt
     most = jnp.minimum(settings.lateral_speed, 0.35 * v) * dt
     y = motion.y + jnp.clip(motion.aim * width - motion.y, -most, most)
-    after = _Motion(s=motion.s + way, v=v, a=a, y=y, aim=motion.aim)
+    after = _Motion(s=motion.s + distance, v=v, a=a, y=y, aim=motion.aim)
 
     own = _Bodies(after.s, y, v)
     near, far = computed_once(

@@ -26,7 +26,7 @@ from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.pdm.policy import PDMClosed, Plan
 from limsim_jax.policies.pdm.road import DT, STEPS, bodies, road_ahead
-from limsim_jax.policies.reference import place_on
+from limsim_jax.policies.reference import to_cartesian
 from limsim_jax.traffic.ego import Trajectory
 from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, State
@@ -110,12 +110,12 @@ def no_past(config: Config, state: State) -> Past:
     count = math.ceil((HISTORY - 1) * HISTORY_TIME / config.decision_time - 1e-6) + 1
     egos = state.egos
     back = config.decision_time * jnp.arange(1, count + 1, dtype=egos.x.dtype)[None]
-    way = -state.v[egos.slot][:, None] * back
-    heading = jnp.broadcast_to(egos.heading[:, None], way.shape)
-    zero = jnp.zeros_like(way)
+    distance = -state.v[egos.slot][:, None] * back
+    heading = jnp.broadcast_to(egos.heading[:, None], distance.shape)
+    zero = jnp.zeros_like(distance)
     return Past(
-        x=egos.x[:, None] + way * jnp.cos(heading),
-        y=egos.y[:, None] + way * jnp.sin(heading),
+        x=egos.x[:, None] + distance * jnp.cos(heading),
+        y=egos.y[:, None] + distance * jnp.sin(heading),
         heading=heading,
         v=zero + state.v[egos.slot][:, None],
         a=zero,
@@ -165,7 +165,7 @@ def features(
     road = road_ahead(lane_map, state, egos.slot, body, strict)
     ahead = jnp.arange(CENTRE_LINE, dtype=egos.x.dtype)[None]
     s = (road.s + body.wheelbase / 2)[:, None] + ahead
-    line = place_on(road.way, s, jnp.zeros_like(s))
+    line = to_cartesian(road.centerline, s, jnp.zeros_like(s))
     every = round(POSE_TIME / DT)
     planned = (values[:, every::every] for values in poses_of(plan))
     return Features(

@@ -16,7 +16,7 @@ from limsim_jax.policies.pdm.proposals import FRACTIONS, idm, leaders, poses
 from limsim_jax.policies.pdm.road import DT, STEPS, Body, bodies, others_around, road_ahead
 from limsim_jax.policies.pdm.score import TTC, Scores, score
 from limsim_jax.policies.pdm.tracker import STOPPING_SPEED, drive_along, fitted
-from limsim_jax.policies.predict import Predictor, straight
+from limsim_jax.policies.predict import Predictor, constant_velocity
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.standards import COMFORT
 from limsim_jax.traffic.ego import Trajectory
@@ -54,7 +54,7 @@ class PDMClosed:
 
     seen: int = 32
     strict_tuplan: bool = False
-    predict: Predictor = straight
+    predict: Predictor = constant_velocity
 
     free = True
     others = 0
@@ -134,10 +134,10 @@ def _stop_along(body: Body, x: Array, y: Array, heading: Array) -> tuple[Array, 
     """The same path of the rear axle, braked with `EMERGENCY_BRAKING` to a standstill."""
     t, v0 = DT * jnp.arange(STEPS + 1, dtype=x.dtype)[None], body.v[:, None]
     braking = jnp.minimum(t, v0 / EMERGENCY_BRAKING)
-    way = v0 * braking - EMERGENCY_BRAKING * braking * braking / 2
+    distance = v0 * braking - EMERGENCY_BRAKING * braking * braking / 2
     steps = safe_norm(jnp.stack([jnp.diff(x), jnp.diff(y)]), 0)
     done = jnp.pad(jnp.cumsum(steps, -1), ((0, 0), (1, 0)))
-    x, y, heading = (jax.vmap(jnp.interp)(way, done, values) for values in (x, y, heading))
+    x, y, heading = (jax.vmap(jnp.interp)(distance, done, values) for values in (x, y, heading))
     return x, y, heading, v0 - EMERGENCY_BRAKING * braking
 
 
@@ -148,10 +148,10 @@ def _stop_straight(body: Body) -> tuple[Array, ...]:
     low, high = COMFORT["acceleration"]
     speed = 1.1 * (v0 + jnp.clip(u, low, high))
     heading = jnp.broadcast_to(body.heading[:, None], (*body.v.shape, STEPS + 1))
-    way = speed * t
+    distance = speed * t
     return (
-        body.x[:, None] + way * jnp.cos(heading),
-        body.y[:, None] + way * jnp.sin(heading),
+        body.x[:, None] + distance * jnp.cos(heading),
+        body.y[:, None] + distance * jnp.sin(heading),
         heading,
         jnp.where(t > 0, speed, v0),
     )

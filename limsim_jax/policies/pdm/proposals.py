@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from limsim_jax.policies.pdm.road import DT, FAR, LOOK_EVERY, OFFSETS, SPACING, Body, Others, Road
-from limsim_jax.policies.reference import place_on
+from limsim_jax.policies.reference import to_cartesian
 from limsim_jax.xla import computed_once, mapped_like
 
 FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)
@@ -25,38 +25,38 @@ LATE_STOP, HARDEST_BEHIND = 1.0, 6.0
 _LEAST_GAP = 0.1  # m: who is nearer than the standstill gap brakes as hard as it can
 _MERGE_TIME, _MERGE_LEAST = 3.0, 12.0  # s and m in which a path comes to an offset 2 m away, or farther,
 _KEEP_SHARE = 0.66  # and the least share of that for one that is nearer
-_COARSE = 4  # points of the way per point where a projection starts
+_COARSE = 4  # points of the centerline per point where a projection starts
 
 
 class Leaders(NamedTuple):
-    """Others in coordinates of the way, at the looks of the IDM: `H`."""
+    """Others in coordinates of the centerline, at the looks of the IDM: `H`."""
 
     rear: Float[Array, "H V 3 K"]  # m, of those on the corridor of a path, else far away
     centre: Float[Array, "H V K"]  # m
-    v: Float[Array, "H V K"]  # m/s along the way
+    v: Float[Array, "H V K"]  # m/s along the centerline
 
 
 @jax.named_scope("pdm_leaders")
 def leaders(road: Road, body: Body, others: Others, steps: int) -> Leaders:
     """Who is on the corridor of each path: the width of the body around it."""
-    way = road.way
+    centerline = road.centerline
     others = others._replace(**{n: getattr(others, n)[:steps:LOOK_EVERY] for n in ("x", "y", "cos", "sin")})
     looks = others.x.shape[0]
     x, y = (jnp.moveaxis(v, 0, 1).reshape(v.shape[1], -1) for v in (others.x, others.y))  # [V, H K]
-    coarse_x, coarse_y = way.x[:, ::_COARSE], way.y[:, ::_COARSE]
+    coarse_x, coarse_y = centerline.x[:, ::_COARSE], centerline.y[:, ::_COARSE]
     apart = (x[:, None] - coarse_x[..., None]) ** 2 + (y[:, None] - coarse_y[..., None]) ** 2  # [V M' HK]
     least = jnp.min(apart, 1)
     number = jnp.arange(coarse_x.shape[1], dtype=x.dtype)[None, :, None]
     s = jnp.min(jnp.where(apart <= least[:, None], number, FAR), 1) * (SPACING * _COARSE)
     s = computed_once(s)
     for _ in range(2):
-        place = place_on(way, s, jnp.zeros_like(s))
+        place = to_cartesian(centerline, s, jnp.zeros_like(s))
         cos, sin = jnp.cos(place.heading), jnp.sin(place.heading)
         dx, dy = x - place.x, y - place.y
         across = cos * dy - sin * dx
         step = (cos * dx + sin * dy) / jnp.maximum(1 - place.curvature * across, 0.3)
         s = computed_once(s + jnp.clip(step, -2 * SPACING * _COARSE, 2 * SPACING * _COARSE))
-    place = place_on(way, s, jnp.zeros_like(s))
+    place = to_cartesian(centerline, s, jnp.zeros_like(s))
     cos, sin = jnp.cos(place.heading), jnp.sin(place.heading)
     d = cos * (y - place.y) - sin * (x - place.x)
 
@@ -70,21 +70,21 @@ def leaders(road: Road, body: Body, others: Others, steps: int) -> Leaders:
     reach = jnp.abs(along) * length + turned * breadth
     beside = turned * length + jnp.abs(along) * breadth + body.width[None, :, None] / 2
     on = jnp.abs(d[:, :, None] - road.offset[None, ..., None]) < beside[:, :, None]
-    on &= (others.there[None] & (s < road.way.reach) & (s > 0))[:, :, None]
+    on &= (others.there[None] & (s < road.centerline.reach) & (s > 0))[:, :, None]
     return Leaders(rear=jnp.where(on, (s - reach)[:, :, None], FAR), centre=s, v=others.v[None] * along)
 
 
 class Proposals(NamedTuple):
     """What the IDM drivers would do on each path: `P` = 15, path by path, `T` moments."""
 
-    s: Float[Array, "V P T"]  # m along the way, rear axle
+    s: Float[Array, "V P T"]  # m along the centerline, rear axle
     v: Float[Array, "V P T"]  # m/s
 
 
 @jax.named_scope("pdm_idm")
 def idm(road: Road, body: Body, along: Leaders, strict: bool) -> Proposals:
     """Integrate the fifteen drivers; each looks for its leader every second step."""
-    limit = road.way.limit
+    limit = road.centerline.limit
     shape = (*body.v.shape, len(OFFSETS), len(FRACTIONS))
     fraction = jnp.broadcast_to(jnp.asarray(FRACTIONS, body.v.dtype), shape)
     last = limit.shape[1] - 1
@@ -178,7 +178,7 @@ def poses(road: Road, body: Body, proposals: Proposals, strict: bool) -> Poses:
         slope = (shift * 6 * u * (u - 1) + slope0 * (1 - u) * (1 - 3 * u)) / reach
         bend = (shift * (12 * u - 6) + slope0 * (6 * u - 4)) / (reach * reach)
         bend = jnp.where(u < 1, bend, 0)
-    place = place_on(road.way, s, d)
+    place = to_cartesian(road.centerline, s, d)
     stretch = jnp.maximum(1 - place.curvature * d, 0.2)
     return Poses(
         x=place.x,

@@ -12,7 +12,7 @@ from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.policies.predict import Predictor, nearest
-from limsim_jax.policies.reference import Way, way_ahead
+from limsim_jax.policies.reference import ReferencePath, reference_path
 from limsim_jax.types import State
 from limsim_jax.xla import computed_once
 
@@ -38,8 +38,8 @@ FAR = 1e6
 """m to an obstacle where there is none."""
 
 _POINTS = 121  # of the reference path: 240 m
-_KEEPS = 61  # points of the way on which all of the body keeps to the road: 120 m
-_LANES = 6  # of the way, beyond the first
+_KEEPS = 61  # points of the centerline on which all of the body keeps to the road: 120 m
+_LANES = 6  # of the centerline, beyond the first
 _CHANGE_WITHIN = 300.0  # m to the last place for a lane change, within which it is wished for
 _CHANGE_ROOM = 20.0  # m before that place, kept free to change lanes from a standstill
 _CHANGE_WORTH = 15.0  # m of progress that a required lane change counts for
@@ -69,12 +69,12 @@ class Body(NamedTuple):
 class Road(NamedTuple):
     """The way that the planned vehicles follow, from the rear axle on, and the paths along it."""
 
-    way: Way
+    centerline: ReferencePath
     s: Float[Array, " V"]  # m, of the rear axle
     d: Float[Array, " V"]  # m
-    slope: Float[Array, " V"]  # m/m, direction of motion against the way
+    slope: Float[Array, " V"]  # m/m, direction of motion against the centerline
     offset: Float[Array, "V 3"]  # m, of the paths
-    wall: Float[Array, "V 3"]  # m along the way, standing obstacle on each of them
+    wall: Float[Array, "V 3"]  # m along the centerline, standing obstacle on each of them
     worth: Float[Array, "V 3"]  # m of progress that a path is worth besides
     half: Float[Array, "V M"]  # m, half the width of the lane
     oncoming: Float[Array, "V M"]  # m, width of the lane for the opposite direction beyond the left edge
@@ -113,7 +113,7 @@ def bodies(state: State, slot: Int[Array, " V"]) -> Body:
 
 @jax.named_scope("pdm_road")
 def road_ahead(lane_map: LaneMap, state: State, slot: Int[Array, " V"], body: Body, strict: bool) -> Road:
-    """Way, paths, and what stands on them: red lights, and the end of lanes that lead nowhere."""
+    """ReferencePath, paths, and what stands on them: red lights, and the end of lanes that lead nowhere."""
     routes = lane_map.routes
     own, previous, goal, front = state.lane[slot], state.previous[slot], state.goal[slot], state.s[slot]
     to_go = routes.lanes_to_go[own, goal]
@@ -134,20 +134,26 @@ def road_ahead(lane_map: LaneMap, state: State, slot: Int[Array, " V"], body: Bo
     first = jnp.where(behind, came, lane)
     after = jnp.where(behind, lane, NO_LANE)
     s = jnp.where(behind, s + lane_map.length[came], s)
-    way = computed_once(
-        way_ahead(lane_map, first, s, goal, points=_POINTS, step=SPACING, lanes=_LANES, after=after)
+    centerline = computed_once(
+        reference_path(lane_map, first, s, goal, points=_POINTS, step=SPACING, lanes=_LANES, after=after)
     )
-    dx, dy = body.x - way.x[:, 0], body.y - way.y[:, 0]
-    cos, sin = jnp.cos(way.heading[:, 0]), jnp.sin(way.heading[:, 0])
+    dx, dy = body.x - centerline.x[:, 0], body.y - centerline.y[:, 0]
+    cos, sin = jnp.cos(centerline.heading[:, 0]), jnp.sin(centerline.heading[:, 0])
     d = cos * dy - sin * dx
-    slope = jnp.tan(jnp.clip(wrap_angle(body.heading - way.heading[:, 0]), -0.5, 0.5))
+    slope = jnp.tan(jnp.clip(wrap_angle(body.heading - centerline.heading[:, 0]), -0.5, 0.5))
 
     across = side.astype(d.dtype) * (width(lane_map, lane, front) + width(lane_map, own, state.s[slot])) / 2
     offset = jnp.broadcast_to(jnp.asarray(OFFSETS, d.dtype), (*d.shape, 3))
     if not strict:
         # in a bend the corners swing out
-        taken = EDGE_MARGIN + body.width[:, None] / 2 + jnp.abs(way.curvature) * body.length[:, None] ** 2 / 8
-        right, left = (jnp.min((x - taken)[:, :_KEEPS], 1)[:, None] for x in (way.right, way.left))
+        taken = (
+            EDGE_MARGIN
+            + body.width[:, None] / 2
+            + jnp.abs(centerline.curvature) * body.length[:, None] ** 2 / 8
+        )
+        right, left = (
+            jnp.min((x - taken)[:, :_KEEPS], 1)[:, None] for x in (centerline.right, centerline.left)
+        )
         offset = jnp.clip(offset, -jnp.maximum(right, 0), jnp.maximum(left, 0))
     towards = jnp.stack([-across, jnp.sign(across) - across, jnp.zeros_like(across)], -1)
     offset = jnp.where(changes[:, None], towards, offset)
@@ -157,19 +163,21 @@ def road_ahead(lane_map: LaneMap, state: State, slot: Int[Array, " V"], body: Bo
     worth = jnp.where(changes, _CHANGE_WORTH, 0.0)
     worth = jnp.stack([jnp.zeros_like(worth), jnp.zeros_like(worth), worth], -1)
 
-    left_most = jnp.where(lane_map.left[way.lane] == NO_LANE, way.lane, lane_map.left[way.lane])
+    left_most = jnp.where(
+        lane_map.left[centerline.lane] == NO_LANE, centerline.lane, lane_map.left[centerline.lane]
+    )
     opposite = lane_map.opposite[left_most]
     return Road(
-        way=way,
+        centerline=centerline,
         s=cos * dx + sin * dy,
         d=d,
         slope=slope,
         offset=offset,
         wall=jnp.minimum(wall[:, None], own_end),
         worth=worth,
-        half=_widths(lane_map, way.lane) / 2,
+        half=_widths(lane_map, centerline.lane) / 2,
         oncoming=jnp.where(opposite == NO_LANE, 0, _widths(lane_map, opposite)),
-        connector=lane_map.is_connector[way.lane],
+        connector=lane_map.is_connector[centerline.lane],
     )
 
 
@@ -188,7 +196,7 @@ def _wall(
     after: Int[Array, " V"],
     strict: bool,
 ) -> Float[Array, " V"]:
-    """m along the way to the first light that says stop, or the end of a lane that leads nowhere."""
+    """m along the centerline to the first light that says stop, or the end of a lane that leads nowhere."""
     routes = lane_map.routes
     shows = lane_states(lane_map.signals, state.lights.phase)
     wall, start = jnp.full_like(s, FAR), -s

@@ -17,7 +17,7 @@ from limsim_jax.numerics import safe_norm
 from limsim_jax.policies.pdm.proposals import FRACTIONS, Proposals
 from limsim_jax.policies.pdm.road import DT, FAR, LOOK_EVERY, SPACING, Body, Others, Road
 from limsim_jax.policies.pdm.tracker import Motion
-from limsim_jax.policies.reference import Place, place_on
+from limsim_jax.policies.reference import Place, to_cartesian
 from limsim_jax.standards import COMFORT
 from limsim_jax.traffic.collision import OVERHANG
 from limsim_jax.xla import computed_once, mapped_like
@@ -43,7 +43,7 @@ class Scores(NamedTuple):
 
 
 class _Places(NamedTuple):
-    """Where the bodies are on the way, every `LOOK_EVERY` steps: `T2` moments."""
+    """Where the bodies are on the centerline, every `LOOK_EVERY` steps: `T2` moments."""
 
     s: Float[Array, "V P T2"]  # m, centre
     off: Bool[Array, "V P T2"]  # a corner is off the road
@@ -63,7 +63,7 @@ def _places(road: Road, body: Body, proposals: Proposals, motion: Motion, strict
 
     def project(s: Array) -> tuple[Place, Array, Array]:
         """The way there, how far left of it the centre is, and a better `s`."""
-        place = computed_once(place_on(road.way, s, jnp.zeros_like(s)))
+        place = computed_once(to_cartesian(road.centerline, s, jnp.zeros_like(s)))
         cos, sin = jnp.cos(place.heading), jnp.sin(place.heading)
         dx, dy = x - place.x, y - place.y
         d = cos * dy - sin * dx
@@ -87,7 +87,7 @@ def _places(road: Road, body: Body, proposals: Proposals, motion: Motion, strict
     at = lambda table: jnp.take_along_axis(  # noqa: E731
         table, k.reshape(k.shape[0], -1), -1
     ).reshape(k.shape)
-    left, right, half = at(road.way.left), at(road.way.right), at(road.half)
+    left, right, half = at(road.centerline.left), at(road.centerline.right), at(road.half)
     slack = 0.0 if strict else OVERHANG - _OVERSHOOT
     off = (most > left + at(road.oncoming) + slack) | (least < -right - slack)
     lane_of = lambda value: (value > half).astype(jnp.int32) - (value < -half).astype(jnp.int32)  # noqa: E731

@@ -154,11 +154,11 @@ def drive_along(reference: Poses, body: Body, steps: int, strict: bool = False) 
             turned = steering + jnp.clip(rate, -_CAR.steering_rate, _CAR.steering_rate) * DT
             turned = jnp.clip(turned, -_CAR.steering, _CAR.steering)
             faster = jnp.maximum(v + (a + reached) / 2 * DT, 0)
-            way = (v + faster) / 2 * DT
+            distance = (v + faster) / 2 * DT
             most = _CAR.lateral_acceleration / jnp.maximum(v * v, 0.1)
-            turn = way * jnp.clip(jnp.tan((steering + turned) / 2) / wheelbase, -most, most)
+            turn = distance * jnp.clip(jnp.tan((steering + turned) / 2) / wheelbase, -most, most)
             course = heading + turn / 2
-            x, y, heading = x + way * jnp.cos(course), y + way * jnp.sin(course), heading + turn
+            x, y, heading = x + distance * jnp.cos(course), y + distance * jnp.sin(course), heading + turn
             v, a, steering = faster, reached, turned
         new = x, y, heading, v, a, steering
         return new, new
