@@ -23,15 +23,9 @@ from synthetic import (
 )
 
 from limsim_jax.maps import read_network
-from limsim_jax.maps.conflicts import (
-    ABSENT,
-    MARGIN,
-    VEHICLE_WIDTH,
-    ConflictType,
-    build_conflicts,
-    connectors,
-    priority_cycles,
-)
+from limsim_jax.maps.conflicts import ConflictType, build_conflicts, connectors, priority_cycles
+from limsim_jax.maps.conflicts.build import MARGIN, VEHICLE_WIDTH
+from limsim_jax.maps.conflicts.table import ABSENT
 from limsim_jax.maps.network import Control, LaneType, Turn
 
 REACH = VEHICLE_WIDTH + MARGIN

@@ -10,6 +10,7 @@ import pytest
 from scipy.special import fresnel
 
 from limsim_jax.maps import lane_map as lm
+from limsim_jax.maps import rasterise
 from limsim_jax.maps.network import (
     Action,
     ImportReport,
@@ -655,6 +656,6 @@ def test_bad_networks_are_refused_with_a_map_error():
 
 
 def test_a_lane_that_cannot_be_followed_is_refused(host, monkeypatch):
-    monkeypatch.setattr(lm, "WORST_DEVIATION", 0.003)
+    monkeypatch.setattr(rasterise, "WORST_DEVIATION", 0.003)
     with pytest.raises(MapError, match=r"lane 'kinked'.*leave the centre line by 0\.00"):
         build_lane_map(host)

@@ -1,0 +1,114 @@
+"""A network to its `ConflictTable`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from limsim_jax.maps.conflicts.overlaps import Overlap, connectors, find_overlaps
+from limsim_jax.maps.conflicts.priority import Decision, RightOfWay, Rule, movement_groups, without_cycles
+from limsim_jax.maps.conflicts.table import ABSENT, ConflictTable, ConflictType
+from limsim_jax.maps.conflicts.waiting import waiting_points
+from limsim_jax.maps.network import Control, Network
+
+VEHICLE_WIDTH = 2.0
+"""Width (m) of the car for which swept paths are compared."""
+
+MARGIN = 0.3
+"""Free space (m) between two cars below which their paths conflict."""
+
+
+def build_conflicts(
+    network: Network,
+    rows: Mapping[str, int],
+    *,
+    vehicle_width: float = VEHICLE_WIDTH,
+    margin: float = MARGIN,
+    break_cycles: bool = True,
+) -> ConflictTable:
+    """Find all conflicts of a network, and who goes first.
+
+    Args:
+        network: The map.
+        rows: Row of every drivable lane (`lane_map.lane_rows`).
+        vehicle_width: Width (m) of the vehicles whose swept paths are compared.
+        margin: Free space (m) that they need between them.
+        break_cycles: Make equal what general rules (not the file, not signs) order in a circle, as
+            right before left does when four cars meet; `tie` keeps the rule. Without it, the circles
+            stay in `prio`.
+
+    Compared are lanes of the same junction, of one road only those side by side, and lanes anywhere that
+    share a successor or a predecessor. Outside junctions the 200 m next to the shared lane count.
+    Lanes more than 3.5 m apart in elevation pass over each other.
+
+    Diverging paths need no priority, and those that sweep are equal. For the others the first rule that
+    tells them apart decides:
+
+    1. what the file says (`Movement.yields_to`); where both yield to each other they are equal;
+    2. control: priority before none or signal before yield, stop and all-way stop; zipper is equal;
+    3. roundabouts: lanes that leave the ring or stay on it before lanes that enter. A ring is a
+       closed path of at most 600 m that turns evenly once round;
+    4. merging lanes: through lanes before entry, ramp and slip lanes;
+    5. turns: straight before turning, U-turns last; of opposing turns the one to the near side first;
+    6. lanes that merge at less than 45 degrees: the road with more lanes, then the faster one first;
+    7. right before left (left before right with left-hand traffic) between 30 and 165 degrees.
+
+    Signals set no priority: the rules hold between movements that are green together, and for all
+    when the lights are off.
+    """
+    lanes = connectors(network)
+    index = {lane.id: k for k, lane in enumerate(lanes)}
+    overlaps = find_overlaps(network, lanes, vehicle_width, margin)
+    right_of_way = RightOfWay(network, lanes)
+    equal = Decision(0, Rule.NONE, 0)
+    decisions = [equal if o.type is ConflictType.SWEEP else right_of_way.decide(o) for o in overlaps]
+    movement = np.array([right_of_way.only_movement(k) for k in range(len(lanes))] + [-1], np.int32)
+    prio = np.array([d.prio for d in decisions], int)
+    tie = np.array([d.tie for d in decisions], int)
+    if break_cycles:
+        nodes = movement_groups(movement)
+        ends = np.array([(o.first, o.second) for o in overlaps], int).reshape(-1, 2)
+        prio = without_cycles(nodes[ends], prio, np.array([d.rule for d in decisions], int))
+
+    entries: list[list[tuple[Overlap, int, int]]] = [[] for _ in lanes]
+    for overlap, p, t in zip(overlaps, prio.tolist(), tie.tolist(), strict=True):
+        t = 0 if p else t
+        entries[overlap.first].append((overlap, p, t))
+        entries[overlap.second].append((overlap.mirrored(), -p, -t))
+    num, slots = len(lanes) + 1, max([0, *map(len, entries)])
+    floats = {name: np.full((num, slots), ABSENT, np.float32) for name in ("s_in", "s_out", "f_in", "f_out")}
+    floats |= {name: np.zeros((num, slots), np.float32) for name in ("sweep", "f_sweep")}
+    ints = {name: np.zeros((num, slots), np.int32) for name in ("foe", "type", "prio", "tie")}
+    ints["foe"][:] = -1
+    clear_s, cross_s = np.zeros(num, np.float32), np.zeros(num, np.float32)
+    must_stop = np.zeros(num, bool)
+    for way in network.movements:
+        if way.via and way.via[0] in index:
+            must_stop[index[way.via[0]]] |= way.control in (Control.STOP, Control.ALL_WAY_STOP)
+    for k, row in enumerate(entries):
+        row.sort(key=lambda entry: (entry[0].s_in, entry[0].s_out, entry[0].second))
+        for c, (overlap, p, t) in enumerate(row):
+            for name in floats:
+                floats[name][k, c] = getattr(overlap, name)
+            ints["foe"][k, c], ints["type"][k, c] = overlap.second, overlap.type
+            ints["prio"][k, c], ints["tie"][k, c] = p, t
+        met = [o.s_out for o, _, _ in row if o.type in (ConflictType.CROSS, ConflictType.MERGE)]
+        clear_s[k] = max(met, default=0.0)
+        cross_s[k] = max([o.s_out for o, _, _ in row if o.type is ConflictType.CROSS], default=0.0)
+
+    connector = np.full(len(rows) + 1, -1, np.int32)
+    for lane_id, k in index.items():
+        connector[rows[lane_id]] = k
+    return ConflictTable(
+        lane=np.array([rows[lane.id] for lane in lanes] + [-1], np.int32),
+        connector=connector,
+        movement=movement,
+        length=np.array([lane.length for lane in lanes] + [1.0], np.float32),
+        wait_s=np.array([*waiting_points(network, lanes, entries, right_of_way), 0.0], np.float32),
+        clear_s=clear_s,
+        cross_s=cross_s,
+        must_stop=must_stop,
+        **floats,
+        **ints,
+    )

@@ -1,0 +1,60 @@
+"""Where a vehicle can wait inside a junction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from limsim_jax.maps.conflicts.overlaps import Overlap
+from limsim_jax.maps.conflicts.priority import RightOfWay
+from limsim_jax.maps.network import Lane, Movement, Network
+
+
+def waiting_points(
+    network: Network,
+    lanes: Sequence[Lane],
+    entries: Sequence[Sequence[tuple[Overlap, int, int]]],
+    right_of_way: RightOfWay,
+    *,
+    before: float = 1.0,
+    at_least: float = 6.0,
+) -> list[float]:
+    """Where traffic may wait inside the junction: arc length (m) from each connector, 0 for nowhere.
+
+    The point lies 1 m before the first conflict with a foe that goes first, and at least 6 m into the
+    junction. It exists for movements that the file lets wait inside; where the file does not speak of
+    this at all, for turns across opposing traffic.
+    """
+    index = {lane.id: k for k, lane in enumerate(lanes)}
+    waiting = [0.0] * len(lanes)
+    told = any(movement.waits_inside for movement in network.movements)
+    for movement in network.movements:
+        chain = [index[name] for name in movement.via if name in index]
+        if len(chain) != len(movement.via) or not chain:
+            continue
+        offsets = np.cumsum([0.0, *(lanes[k].length for k in chain)])
+        foes = [
+            (offset + o.s_in, o.second)
+            for k, offset in zip(chain, offsets, strict=False)
+            for o, prio, _ in entries[k]
+            if prio < 0
+        ]
+        waits = movement.waits_inside or (not told and _opposed(movement, chain[0], foes, right_of_way))
+        point = min((s for s, _ in foes), default=0.0) - before
+        if waits and point >= at_least:
+            for k, offset in zip(chain, offsets, strict=False):
+                if point > offset:
+                    waiting[k] = float(point - offset)
+    return waiting
+
+
+def _opposed(movement: Movement, k: int, foes: Iterable[tuple[float, int]], right_of_way: RightOfWay) -> bool:
+    """Whether a movement turns across traffic from the opposite side that goes first."""
+    own = next(path for path in right_of_way.paths(k) if path.movement is movement)
+    return own.far_side and any(
+        abs(math.remainder(path.approach - own.approach, math.tau)) > math.radians(120)
+        for _, foe in foes
+        for path in right_of_way.paths(foe)
+    )
