@@ -24,12 +24,12 @@ from limsim_jax.calibration.closed_loop import (
 )
 from limsim_jax.calibration.fit import PARAMETERS
 from limsim_jax.calibration.matching import Engine, TrafficFlow, match
-from limsim_jax.calibration.recordings import read_recording
 from limsim_jax.calibration.report import gather
 from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, bundled_maps, read_network
 from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.routing import default_goals
+from limsim_jax.recordings import read_recording
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.traffic.demand import Flow, build_demand
 from limsim_jax.traffic.engine import Traffic

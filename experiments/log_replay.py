@@ -23,12 +23,12 @@ import numpy as np
 
 from limsim_jax.files import write_whole
 from limsim_jax.log_replay.pilot import PolicyPilot
-from limsim_jax.log_replay.recorded import Lanelet, Recorded, lanelet_network, read_platoon, read_scene
 from limsim_jax.log_replay.scene import Scene, build_scene
 from limsim_jax.log_replay.takeover import Record, as_logged, braking, replay, replay_many
 from limsim_jax.maps import build_lane_map
 from limsim_jax.policies.limsim_tm.policy import LimSimTM
 from limsim_jax.policies.pdm import PDMClosed
+from limsim_jax.recordings import Lanelet, Tracks, lanelet_network, read_platoon, read_tracks
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
@@ -43,7 +43,7 @@ DRIVEN = 6.0  # s of its log that a vehicle has left when a planner takes its wh
 AFTER = 1.0  # s after its first entry, or after the start of the benchmark's range, the ego brakes
 
 
-def platoon(cars: int = 12, seconds: float = 60.0, dt: float = 0.1) -> Recorded:
+def platoon(cars: int = 12, seconds: float = 60.0, dt: float = 0.1) -> Tracks:
     """A made platoon of different cars on one lane, whose speed waves gently: long enough to come back."""
     t = np.arange(round(seconds / dt)) * dt
     v = 15 + 2 * np.sin(2 * np.pi * t / 25)
@@ -53,7 +53,7 @@ def platoon(cars: int = 12, seconds: float = 60.0, dt: float = 0.1) -> Recorded:
     x = start + way[:, None]
     lane = np.linspace(0, 1600, 161)
     lanelet = Lanelet("1", np.stack([lane, 0 * lane + 1.75], -1), np.stack([lane, 0 * lane - 1.75], -1))
-    return Recorded(
+    return Tracks(
         name="made platoon", source="made platoon", dt=dt, vehicles=tuple(str(k) for k in range(cars)),
         x=x, y=0 * x, heading=0 * x, v=np.repeat(v[:, None], cars, 1), length=length,
         width=np.full(cars, 1.8), network=lanelet_network([lanelet], "made platoon", "made platoon"),
@@ -69,7 +69,7 @@ def egos_of(scene: Scene, way: tuple[float, float], left: float = 1.0) -> Any:
     return brake(jnp.asarray(slots, jnp.int32), jnp.asarray(start, jnp.float32))
 
 
-def measure(recorded: Recorded) -> list[dict[str, Any]]:
+def measure(recorded: Tracks) -> list[dict[str, Any]]:
     """Rows of the table for a scene."""
     scene = build_scene(recorded, build_lane_map(recorded.network))
     valid = np.asarray(scene.log.valid)
@@ -108,7 +108,7 @@ def measure(recorded: Recorded) -> list[dict[str, Any]]:
     return rows
 
 
-def driven(recorded: Recorded) -> list[dict[str, Any]]:
+def driven(recorded: Tracks) -> list[dict[str, Any]]:
     """Planners at the wheel of each vehicle in turn, until its log ends."""
     lane_map = build_lane_map(recorded.network)
     scene = build_scene(recorded, lane_map)
@@ -149,7 +149,7 @@ def driven(recorded: Recorded) -> list[dict[str, Any]]:
     return rows
 
 
-def benchmark(recorded: Recorded, variants: int) -> dict[str, Any]:
+def benchmark(recorded: Tracks, variants: int) -> dict[str, Any]:
     """Time of many variants of a scene in one program."""
     scene = build_scene(recorded, build_lane_map(recorded.network))
     rng = np.random.default_rng(0)
@@ -251,7 +251,7 @@ def main() -> None:
     missing = [part for part in PARTS if part not in {*found, *options.part}]
     if missing:
         parser.error(f"--part: nothing is known of {', '.join(missing)}; name them too")
-    scenes = [platoon(), *(read_scene(path) for path in files)]
+    scenes = [platoon(), *(read_tracks(path) for path in files)]
     for name, start in PLATOONS.items():
         scenes.append(read_platoon(options.data / f"openacc_zalazone_{name}.csv.gz", start, STRETCH))
     busy = next(scene for scene in scenes if scene.name == BENCHMARK)

@@ -22,7 +22,7 @@ ORDER = [
     {"types"},
     {"statistics"},
     {"maps"},
-    {"traffic"},
+    {"traffic", "recordings"},
     {"policies"},
     {"simulation"},
     {"metrics"},

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from limsim_jax.calibration.recordings import Recording, RecordingError
+from limsim_jax.recordings import Recording, RecordingError
 
 SMOOTHING = 1.0
 """s, width of the window."""

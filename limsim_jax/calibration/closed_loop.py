@@ -40,7 +40,7 @@ from scipy.stats import truncnorm, wasserstein_distance
 from limsim_jax.calibration.cleaning import Segment, segments
 from limsim_jax.calibration.fit import LOWER, MODELS, PARAMETERS, UPPER, driver, fit
 from limsim_jax.calibration.population import IDENTIFIED, Law, estimate, write_population
-from limsim_jax.calibration.recordings import RecordingError, Source, as_recording
+from limsim_jax.recordings import RecordingError, Source, as_recording
 from limsim_jax.traffic.car_following import CarFollowing, ballistic
 from limsim_jax.traffic.vehicles import CUT, default_population, sample_vehicles
 

@@ -24,8 +24,8 @@ from limsim_jax.calibration.fit import (
     stack,
 )
 from limsim_jax.calibration.population import Law, estimate, predictive_check, write_population
-from limsim_jax.calibration.recordings import Recording, RecordingError, Source, as_recording
 from limsim_jax.calibration.uncertainty import Uncertainty, uncertainty
+from limsim_jax.recordings import Recording, RecordingError, Source, as_recording
 
 PUBLISHED = (0.11, 0.29)
 """Errors of calibrated car-following models, the IDM among them (Kesting, Treiber 2008)."""

@@ -58,10 +58,10 @@ def calibrate(
         linked_recordings,
         single_fits,
     )
-    from limsim_jax.calibration.recordings import read_recording
     from limsim_jax.calibration.report import calibrate as fit
     from limsim_jax.calibration.report import gather
     from limsim_jax.files import write_whole
+    from limsim_jax.recordings import read_recording
     from limsim_jax.xla import enable_compilation_cache
 
     check_writable(out, json_file)

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial import KDTree
 
-from limsim_jax.log_replay.recorded import Recorded
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, lane_ids, project, relative
 from limsim_jax.maps.network import Network
+from limsim_jax.recordings.tracks import Tracks
 from limsim_jax.types import Driver
 from limsim_jax.xla import interval
 
@@ -84,7 +84,7 @@ class Scene:
     v0: Float[Array, " N"]  # m/s, desired speed of those taken over
 
 
-def build_scene(recorded: Recorded, lane_map: LaneMap) -> Scene:
+def build_scene(recorded: Tracks, lane_map: LaneMap) -> Scene:
     """Arrays of a recorded scene; `lane_map`: of `recorded.network`.
 
     Raises:
@@ -327,7 +327,7 @@ def _clearance(pose: Floats, length: Floats, width: Floats, valid: NDArray[np.bo
 
 
 def _drivers(
-    recorded: Recorded, p: Floats, v: Floats, valid: NDArray[np.bool_], seen: Floats
+    recorded: Tracks, p: Floats, v: Floats, valid: NDArray[np.bool_], seen: Floats
 ) -> tuple[Driver, Floats]:
     """Drivers that keep shorter gaps than the vehicle kept in the log, and their desired speeds.
 

@@ -24,9 +24,9 @@ from limsim_jax.calibration.fit import (
     rollout,
     stack,
 )
-from limsim_jax.calibration.recordings import read_recording
 from limsim_jax.calibration.synthetic import TYPICAL, drivers, follow
 from limsim_jax.calibration.uncertainty import uncertainty
+from limsim_jax.recordings import read_recording
 
 DT = 0.1
 

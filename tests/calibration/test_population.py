@@ -19,9 +19,9 @@ from limsim_jax.calibration.population import (
     residual_process,
     write_population,
 )
-from limsim_jax.calibration.recordings import RecordingError
 from limsim_jax.calibration.report import calibrate
 from limsim_jax.calibration.synthetic import TYPICAL, follow
+from limsim_jax.recordings import RecordingError
 from limsim_jax.sweep.episode import Episodes
 from limsim_jax.sweep.experiment import ExperimentError, read_experiments
 from limsim_jax.traffic.population_file import read_population
@@ -218,7 +218,7 @@ def test_too_little_is_refused(tmp_path):
         calibrate([])
     with pytest.raises(ValueError, match=r"first = 1\.5"):
         calibrate(tmp_path / "x.csv", first=1.5)
-    with pytest.raises(RecordingError, match=r"x\.csv: No such file"):
+    with pytest.raises(RecordingError, match=r"x\.csv: no such file"):
         calibrate(tmp_path / "x.csv")
     two = np.tile(TYPICAL, (2, 1))
     found = Fit(

@@ -9,8 +9,9 @@ from paths import SHARED, needs_shared
 
 from limsim_jax.calibration.cleaning import segments, split_in_time
 from limsim_jax.calibration.closed_loop import linked_recordings
-from limsim_jax.calibration.recordings import FOOT, RecordingError, read_recording
 from limsim_jax.calibration.report import gather
+from limsim_jax.recordings import RecordingError, read_recording
+from limsim_jax.recordings.recording import FOOT
 
 TRAJECTORIES = SHARED / "trajectories"
 SAMPLES, DT = 301, 0.1
@@ -302,8 +303,8 @@ BAD = {
         "line 1: column preceding_vel is missing",
     ),
     "unknown": ("a,b\n1,2\n", "line 1: no recording of a known kind"),
-    "not a number": (put(17, "v_vel", "fast"), "line 17, column v_vel: 'fast'; a number"),
-    "NaN": (put(30, "local_y", "NaN"), "line 30, column local_y: NaN; a finite number"),
+    "not a number": (put(17, "v_vel", "fast"), "line 17, column v_vel: 'fast'; a finite number"),
+    "NaN": (put(30, "local_y", "NaN"), "line 30, column local_y: 'NaN'; a finite number"),
     "no value": (put(31, "preceding_local_y", ""), "line 31, column preceding_local_y: no value"),
     "one value less": (
         edited(lambda lines: [*lines[:9], lines[9].rpartition(",")[0], *lines[10:]]),
@@ -365,7 +366,7 @@ def test_units_that_do_not_go_together_are_refused(columns, factor, hint, tmp_pa
     with pytest.raises(RecordingError) as caught:
         read_recording(pairs_file(tmp_path, scaled(columns, factor)))
     assert hint in str(caught.value)
-    assert "would be right" in str(caught.value)
+    assert "m and m/s are expected" in str(caught.value)
 
 
 def test_feet_are_refused_in_other_kinds(tmp_path):
@@ -397,10 +398,10 @@ def test_milliseconds_are_no_seconds(tmp_path):
         read_recording(path)
 
 
-def test_a_meta_file_that_is_missing_is_named(tmp_path):
+def test_a_missing_meta_file_is_named(tmp_path):
     path = highd(tmp_path)
     (tmp_path / "01_recordingMeta.csv").unlink()
-    with pytest.raises(RecordingError, match=r"01_recordingMeta\.csv: No such file"):
+    with pytest.raises(RecordingError, match=r"01_recordingMeta\.csv: no such file"):
         read_recording(path)
 
 

@@ -1,0 +1,102 @@
+"""Which reader a file is for.
+
+The kind of a file is told by its columns. Whatever makes a number mean something else (columns or values
+missing, wrong units, a time twice) refuses the file with a `RecordingError`. Defects that real recordings
+have here and there (time missing, bodies that overlap, a leader behind its follower) are listed in
+`Recording.defects`, unless more than `checks.TOLERATED` of the followers have some: then they too refuse it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from limsim_jax.maps.network import MapError
+from limsim_jax.recordings.checks import checked
+from limsim_jax.recordings.commonroad import read_commonroad, read_commonroad_tracks
+from limsim_jax.recordings.highd import read_highd
+from limsim_jax.recordings.ind import read_ind
+from limsim_jax.recordings.lanelets import SPEED_LIMIT
+from limsim_jax.recordings.ngsim import read_ngsim, read_pairs
+from limsim_jax.recordings.openacc import read_openacc
+from limsim_jax.recordings.recording import Recording, RecordingError, Source
+from limsim_jax.recordings.scene_tables import read_scene_tables
+from limsim_jax.recordings.table import Table, header_of, read_bytes
+from limsim_jax.recordings.tgsim import read_tgsim
+from limsim_jax.recordings.tracks import Tracks
+
+# Columns that tell the kinds apart; readers name the others that they miss.
+_READERS = (
+    ({"pair_id", "frame_id"}, read_pairs),
+    ({"xleaderreal", "xfollowerreal"}, read_tgsim),
+    ({"trackid", "xcenter"}, read_ind),
+    ({"laneid", "precedingid"}, read_highd),
+    ({"vehicle_id", "frame_id", "local_y"}, read_ngsim),
+)
+
+KINDS = "NGSIM, TGSIM pairs, OpenACC, highD, inD, CommonRoad"
+
+
+def read_recording(path: str | Path) -> Recording:
+    """Read followers and leaders; of highD and inD the `..._tracks.csv`, with its meta files beside it.
+
+    Args:
+      path: of a file of NGSIM (feet, or the metric table of pairs), TGSIM pairs, OpenACC, highD, inD and
+        its relatives (rounD, exiD, uniD), or CommonRoad; also gzipped.
+
+    Raises:
+      RecordingError: what is wrong and where, in one line.
+    """
+    path = Path(path)
+    data = read_bytes(path)
+    if _is_xml(data):
+        try:
+            return checked(read_commonroad(path, data))
+        except MapError as error:
+            raise RecordingError(str(error)) from None
+    columns = header_of(data)
+    if columns[0] in ("Date", "Vehicle_order"):
+        return checked(read_openacc(path, data))
+    known = {name.lower() for name in columns}
+    for signs, reader in _READERS:
+        if signs <= known:
+            return checked(reader(Table.read(path, data)))
+    near = max(_READERS, key=lambda reader: len(reader[0] & known))[0]
+    if near & known:
+        missing = ", ".join(sorted(near - known))
+        raise RecordingError(f"{path}: line 1: column {missing} is missing; found are {', '.join(columns)}")
+    raise RecordingError(
+        f"{path}: line 1: no recording of a known kind ({KINDS}); its columns are {', '.join(columns)[:200]}"
+    )
+
+
+def as_recording(source: Source) -> Recording:
+    """The recording itself, or the file read, with the errors of `read_recording`."""
+    return source if isinstance(source, Recording) else read_recording(source)
+
+
+def read_tracks(path: str | Path, scenario: str | None = None, *, speed_limit: float = SPEED_LIMIT) -> Tracks:
+    """Read the tracks of a recorded scene with its lanes.
+
+    Args:
+      path: a CommonRoad XML file, or the table `scenes_vehicles.csv`; also gzipped.
+      scenario: which one of the table; not needed if it has only one.
+      speed_limit: m/s, of the lanes: no recording tells it for all of them.
+
+    Raises:
+      RecordingError: one line that names file, line and column or element, and what is expected.
+    """
+    path = Path(path)
+    data = read_bytes(path)
+    try:
+        if _is_xml(data):
+            return read_commonroad_tracks(path, data, speed_limit)
+        return read_scene_tables(path, data, scenario, speed_limit)
+    except MapError as error:
+        raise RecordingError(str(error)) from None
+
+
+def _is_xml(data: bytes) -> bool:
+    return data[:200].lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+
+
+__all__ = ["KINDS", "as_recording", "read_recording", "read_tracks"]
