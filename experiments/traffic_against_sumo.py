@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from limsim_jax.maps import build_lane_map, read_network
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import Network
-from limsim_jax.maps.sumo_demand import read_demand
+from limsim_jax.maps.sumo import read_demand
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.traffic.car_following import ACC, IDM
 from limsim_jax.traffic.demand.sumo import SumoScenario, sumo_scenario

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
@@ -41,7 +40,7 @@ def read_network(path: str | Path, *, cache: bool = True) -> Network:
     if isinstance(network, Network):
         network = dataclasses.replace(network, source=str(path))
     else:
-        network = _read(path, _root_element(data, path))
+        network = _read(path, xml.root_name(data, path))
         if network.file_hash != file_hash:  # the file changed between the two looks at it
             return network
         if cache:
@@ -115,18 +114,3 @@ def _read(path: Path, root: str) -> Network:
     raise MapError(
         f"the root element is <{root}>; maps have <OpenDRIVE> (OpenDRIVE) or <net> (SUMO)", file=path, line=1
     )
-
-
-def _root_element(data: bytes, path: Path) -> str:
-    """Local name of the root element; nothing after its start tag is parsed."""
-    from lxml import etree
-
-    try:
-        start = etree.iterparse(
-            io.BytesIO(data), events=("start",), resolve_entities=False, no_network=True, load_dtd=False
-        )
-        return etree.QName(next(iter(start))[1]).localname
-    except (etree.XMLSyntaxError, StopIteration) as error:
-        line = getattr(error, "lineno", None)
-        reason = getattr(error, "msg", None) or "it has no root element"
-        raise MapError(f"not well-formed XML: {reason}", file=path, line=line) from None

@@ -41,13 +41,13 @@ class CommonRoad:
         name, dt = path.name, math.nan
         lanelets: list[Lanelet] = []
         states: list[tuple[Any, ...]] = []
-        read = xml.Reader(path)
-        for root, element in xml.top_level(data, path, "commonRoad"):
+        read = xml.XmlReader(path)
+        for root, element in read.children(data, "commonRoad"):
             name = root.get("benchmarkID", path.name)
             if math.isnan(dt):
                 dt = read.number(root, "timeStepSize")
                 if not 0 < dt <= 1:
-                    read.fail(root, f"timeStepSize is {dt:g} s; more than 0 and at most 1 is expected")
+                    raise read.error(root, f"timeStepSize is {dt:g} s; more than 0 and at most 1 is expected")
             if element.tag == "lanelet" and element.find("leftBound") is not None:
                 lanelets.append(_lanelet(read, element))
             elif element.tag in ("dynamicObstacle", "obstacle") and element.find("trajectory") is not None:
@@ -65,28 +65,28 @@ class CommonRoad:
         return cls(name, xml.file_hash(data), dt, tuple(lanelets), np.array(kind, str), rows)
 
 
-def _states(read: xml.Reader, obstacle: Any, kind: str) -> list[tuple[Any, ...]]:
+def _states(read: xml.XmlReader, obstacle: Any, kind: str) -> list[tuple[Any, ...]]:
     """Line, id, kind, step, x, y, heading, v, length and width of every state."""
     vehicle = read.text(obstacle, "id")
-    size = [_number(read, obstacle, f"shape/rectangle/{side}") for side in ("length", "width")]
+    size = [read.content(obstacle, f"shape/rectangle/{side}") for side in ("length", "width")]
     first = obstacle.find("initialState")
     if first is None:
-        read.fail(obstacle, "has no <initialState>")
+        raise read.error(obstacle, "has no <initialState>")
     children = ("time/exact", "position/point/x", "position/point/y", "orientation/exact", "velocity/exact")
     return [
-        (state.sourceline, vehicle, kind, *(_number(read, state, child) for child in children), *size)
+        (state.sourceline, vehicle, kind, *(read.content(state, child) for child in children), *size)
         for state in (first, *obstacle.iterfind("trajectory/state"))
     ]
 
 
-def _lanelet(read: xml.Reader, element: Any) -> Lanelet:
+def _lanelet(read: xml.XmlReader, element: Any) -> Lanelet:
     bounds = []
     for side in ("leftBound", "rightBound"):
         points = [
-            [_number(read, point, axis) for axis in ("x", "y")] for point in element.iterfind(f"{side}/point")
+            [read.content(point, axis) for axis in ("x", "y")] for point in element.iterfind(f"{side}/point")
         ]
         if len(points) < 2:
-            read.fail(element, f"<{side}> has {len(points)} points; at least 2 are expected")
+            raise read.error(element, f"<{side}> has {len(points)} points; at least 2 are expected")
         bounds.append(np.array(points))
 
     def beside(side: str) -> str | None:
@@ -102,18 +102,6 @@ def _lanelet(read: xml.Reader, element: Any) -> Lanelet:
         beside("adjacentRight"),
         *links,
     )
-
-
-def _number(read: xml.Reader, element: Any, child: str) -> float:
-    text = element.findtext(child)
-    try:
-        value = float(text) if text is not None else math.nan
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        found = "missing" if text is None else f"'{text.strip()[:30]}'"
-        read.fail(element, f"<{child}> is {found}; a finite number is expected")
-    return value
 
 
 def read_commonroad(path: Path, data: bytes) -> Recording:

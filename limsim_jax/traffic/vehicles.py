@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES, LaneMap
 from limsim_jax.maps.network import MapError
-from limsim_jax.maps.sumo_demand import VehicleType
+from limsim_jax.maps.sumo.records import VehicleType
 from limsim_jax.types import Driver, Shape
 from limsim_jax.xla import computed_once
 

@@ -748,7 +748,7 @@ GOOD = road("1", [section(0, [], [lane(-1)])])
         (GOOD.replace("<line/>", "<loop/>"), "unknown shape"),
         (GOOD.replace("<line/>", ""), "has no shape"),
         (GOOD.replace("<line/>", '<arc curvature="1e9"/>'), "curvature is in 1/m"),
-        (GOOD.replace('hdg="0.0"', 'hdg="east"'), "attribute 'hdg' is 'east', not a number"),
+        (GOOD.replace('hdg="0.0"', 'hdg="east"'), "attribute 'hdg' is 'east', not a finite number"),
         (GOOD.replace('lane id="-1"', 'lane id="1"'), "lane id 1 cannot stand in <right>"),
         (GOOD.replace('lane id="-1"', 'lane id="-1.5"'), "not a whole number"),
         (GOOD + GOOD, "id '1' is taken by line"),

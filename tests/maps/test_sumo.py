@@ -20,7 +20,8 @@ from lxml import etree
 from paths import SHARED, needs_shared
 
 from limsim_jax.maps.network import Action, Control, LaneType, MapError, Network
-from limsim_jax.maps.sumo import VEHICLE_CLASSES, Curve, distance_to_polyline, fit_polyline, read_sumo
+from limsim_jax.maps.sumo import VEHICLE_CLASSES, read_sumo
+from limsim_jax.maps.sumo.shapes import Curve, distance_to_polyline, fit_polyline
 
 SUMO = SHARED / "sumo"
 NETS = sorted(SUMO.glob("*/*.net.xml"))
@@ -323,8 +324,8 @@ def test_roundabout_and_unknown_elements_are_reported(read):
     network = read(junction_net(extra=extra, junction='odd="1"'))
     assert network.junctions["j"].roundabout
     counts = network.report.counts
-    assert counts["odd", Action.IGNORED] == 2 and len(notes(network, Action.IGNORED, "odd")) == 1
-    assert counts["prohibition", Action.IGNORED] == 1 and counts["junction@odd", Action.IGNORED] == 1
+    assert counts["net/odd", Action.IGNORED] == 2 and len(notes(network, Action.IGNORED, "net/odd")) == 1
+    assert counts["net/prohibition", Action.IGNORED] == 1 and counts["junction@odd", Action.IGNORED] == 1
     assert counts["roundabout", Action.READ] == 1
 
 
@@ -583,9 +584,9 @@ BAD: dict[str, tuple[str | bytes, str]] = {
     "external entity": ('<!DOCTYPE net [<!ENTITY x SYSTEM "file:///etc/passwd">]>' + GOOD, "DOCTYPE"),
     "no id": (GOOD.replace('<edge id="w"', "<edge"), "'id' is missing"),
     "no speed": (GOOD.replace('speed="10"', "", 1), "'speed' is missing"),
-    "nan": (GOOD.replace('speed="10"', 'speed="nan"', 1), "speed='nan' is not a finite number"),
+    "nan": (GOOD.replace('speed="10"', 'speed="nan"', 1), "'speed' is 'nan', not a finite number"),
     "inf": (GOOD.replace('length="100.0"', 'length="1e999"', 1), "not a finite number"),
-    "text": (GOOD.replace('index="0" speed', 'index="x" speed', 1), "index='x'"),
+    "text": (GOOD.replace('index="0" speed', 'index="x" speed', 1), "'index' is 'x'"),
     "negative": (GOOD.replace('length="100.0"', 'length="-1"', 1), "below 0"),
     "shape": (GOOD.replace('shape="0,0 4,0"', 'shape="0,0 4"'), "is not x,y"),
     "shape nan": (GOOD.replace('shape="0,0 4,0"', 'shape="0,0 4,nan"'), "not a finite number"),
@@ -601,8 +602,8 @@ BAD: dict[str, tuple[str | bytes, str]] = {
     "no such via": (GOOD.replace('via=":j_1_0"', 'via="q"'), "no lane via='q'"),
     "incoming": (GOOD.replace('incLanes="w_0', 'incLanes="q'), "no incoming lane 'q'"),
     "internal": (GOOD.replace('intLanes=":j_3_0 ', 'intLanes="q '), "no internal lane 'q'"),
-    "dir": (GOOD.replace('dir="s"', 'dir="x"', 1), "dir='x'"),
-    "state": (GOOD.replace('state="m"', 'state="q"', 1), "state='q'"),
+    "dir": (GOOD.replace('dir="s"', 'dir="x"', 1), "'dir' is 'x'"),
+    "state": (GOOD.replace('state="m"', 'state="q"', 1), "'state' is 'q'"),
     "short bits": (GOOD.replace('response="10"', 'response="1"'), "1 bits of response"),
     "odd bits": (GOOD.replace('foes="01"', 'foes="2x"'), "letters other than 0 and 1"),
     "request twice": (GOOD.replace('request index="1"', 'request index="0"'), "second request"),

@@ -12,14 +12,9 @@ import sumolib
 from paths import SHARED, needs_shared
 
 from limsim_jax.maps.network import Action, MapError
-from limsim_jax.maps.sumo import VEHICLE_CLASSES, read_sumo
-from limsim_jax.maps.sumo_demand import (
-    Demand,
-    Distribution,
-    SpeedFactor,
-    read_demand,
-    read_sumocfg,
-)
+from limsim_jax.maps.sumo import VEHICLE_CLASSES, read_demand, read_sumo
+from limsim_jax.maps.sumo.config import read_sumocfg
+from limsim_jax.maps.sumo.records import Demand, Distribution, SpeedFactor
 
 SUMO = SHARED / "sumo"
 
@@ -302,12 +297,13 @@ def test_unknown_things_are_reported(read):
            <trip id="2" depart="0" fromTaz="t" toTaz="u"/>"""
     )
     counts = demand.report.counts
-    assert counts["person", Action.IGNORED] == 2 and counts["odd", Action.IGNORED] == 2
+    assert counts["routes/person", Action.IGNORED] == 2
+    assert counts["routes/odd", Action.IGNORED] == counts["vType/odd", Action.IGNORED] == 1
     notes = [str(n) for n in demand.report.notes]
     assert any("vType none: used 1 times" in n for n in notes)
     assert any("trip 2: origin or destination is no edge" in n for n in notes)
     assert demand.vehicles["2"].parameters == {"fromTaz": "t", "toTaz": "u"}
-    assert len([n for n in notes if " person " in n]) == 1
+    assert len([n for n in notes if " routes/person " in n]) == 1
 
 
 def test_several_files_refer_to_one_another(tmp_path):
@@ -367,12 +363,12 @@ BAD = {
     "two routes": (VEHICLE.replace("<route", '<route edges="y"/><route'), "more than one route"),
     "unknown route": ('<vehicle id="1" depart="0" route="q"/>', "no route 'q'"),
     "empty route": (VEHICLE.replace('edges="x"', 'edges=""'), "no edges"),
-    "lane": (VEHICLE.replace("depart=", 'departLane="1.5" depart='), "not an integer"),
+    "lane": (VEHICLE.replace("depart=", 'departLane="1.5" depart='), "not a whole number"),
     "pos": (VEHICLE.replace("depart=", 'departPos="nan" depart='), "not a finite number"),
     "type twice": ('<vType id="a"/><vType id="a"/>', "taken"),
     "class": ('<vType id="a" vClass="ufo"/>', "vClass='ufo'"),
     "length": ('<vType id="a" length="0"/>', "below"),
-    "accel": ('<vType id="a" accel="x"/>', "accel='x'"),
+    "accel": ('<vType id="a" accel="x"/>', "'accel' is 'x'"),
     "factor": ('<vType id="a" speedFactor="normc(1)"/>', "1 parameters"),
     "factor 2": ('<vType id="a" speedFactor="normc(1,0.1,2,1)"/>', "wrong way round"),
     "empty distribution": ('<vTypeDistribution id="a"/>', "empty"),
@@ -423,7 +419,7 @@ def test_bad_configurations(tmp_path):
         ("<configuration/>", "0 networks"),
         ('<configuration><net-file value="q.net.xml"/></configuration>', r"do not exist: .*q\.net\.xml"),
         ("<routes/>", "root element"),
-        ('<configuration><begin value="x"/><n value="run.sumocfg"/></configuration>', "begin='x'"),
+        ('<configuration><begin value="x"/><n value="run.sumocfg"/></configuration>', "'begin' is 'x'"),
     ):
         path.write_text(content)
         with pytest.raises(MapError, match=message):

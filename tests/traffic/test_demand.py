@@ -23,7 +23,7 @@ from limsim_jax.maps.network import MapError
 from limsim_jax.maps.origins import origins
 from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.maps.routing import default_goals
-from limsim_jax.maps.sumo_demand import read_demand
+from limsim_jax.maps.sumo import read_demand
 from limsim_jax.traffic.car_following import safe_speed
 from limsim_jax.traffic.demand import (
     AT_ONCE,

@@ -13,7 +13,7 @@ from paths import SHARED, needs_shared
 
 from limsim_jax.maps import build_lane_map, read_network
 from limsim_jax.maps.signals import phase_at
-from limsim_jax.maps.sumo_demand import read_demand
+from limsim_jax.maps.sumo import read_demand
 from limsim_jax.traffic.demand.sumo import sumo_scenario
 
 needs_sumo = pytest.mark.skipif(

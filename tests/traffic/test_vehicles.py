@@ -10,7 +10,7 @@ from scipy import stats
 
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES
 from limsim_jax.maps.network import MapError
-from limsim_jax.maps.sumo_demand import read_demand
+from limsim_jax.maps.sumo import read_demand
 from limsim_jax.traffic import vehicles as vh
 
 N = 100_000

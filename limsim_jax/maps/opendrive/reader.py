@@ -16,14 +16,10 @@ from limsim_jax.maps.network import ImportReport, Lane, MapError, Network, Road
 from limsim_jax.maps.opendrive.furniture import Furnisher, extend_lights, regulate
 from limsim_jax.maps.opendrive.lanes import Cutter, Piece, lane_id, sample_piece
 from limsim_jax.maps.opendrive.links import Linker, build_movements
-from limsim_jax.maps.opendrive.records import (
-    Parser,
-    RawController,
-    RawJunction,
-    RawRoad,
-)
+from limsim_jax.maps.opendrive.parser import Parser
+from limsim_jax.maps.opendrive.records import RawController, RawJunction, RawRoad
 from limsim_jax.maps.signals import generate_programs
-from limsim_jax.maps.xml import Reader, file_hash, read_bytes, top_level
+from limsim_jax.maps.xml import XmlReader, file_hash, read_bytes
 
 LARGEST = 1e8  # m, coordinates beyond this are not on Earth
 
@@ -43,13 +39,13 @@ def read_opendrive(path: str | Path) -> Network:
     """
     path = Path(path)
     data = read_bytes(path)
-    reader, report = Reader(path), ImportReport()
+    reader, report = XmlReader(path), ImportReport()
     parser = Parser(reader, report)
     raw_roads: list[RawRoad] = []
     raw_junctions: list[RawJunction] = []
     controllers: list[RawController] = []
     version, name, geo_reference = "1.4", "", ""
-    for _, element in top_level(data, path, "OpenDRIVE"):
+    for _, element in reader.children(data, "OpenDRIVE"):
         match element.tag:
             case "header":
                 version = f"{reader.text(element, 'revMajor', '1')}.{reader.text(element, 'revMinor', '4')}"
@@ -65,7 +61,7 @@ def read_opendrive(path: str | Path) -> Network:
                             child.sourceline,
                         )
                     else:
-                        parser.ignored.add(child, "header")
+                        parser.ignore(child)
             case "road":
                 raw_roads.append(parser.road(element))
             case "junction":
@@ -73,7 +69,7 @@ def read_opendrive(path: str | Path) -> Network:
             case "controller":
                 controllers.append(parser.controller(element))
             case _:
-                parser.ignored.add(element, str(element.get("id", "")))
+                parser.ignore(element)
     if not raw_roads:
         raise MapError("has no <road>", file=path)
     roads, junctions = _by_id(raw_roads, "road", path), _by_id(raw_junctions, "junction", path)
@@ -103,7 +99,7 @@ def read_opendrive(path: str | Path) -> Network:
     furniture = Furnisher(roads, pieces, lanes, movements, controllers, report).run()
     furniture.lights = extend_lights(furniture.lights, movements, lanes, report)
     movements = regulate(movements, lanes, furniture.lights, furniture.signs, report)
-    parser.ignored.report(report)
+    reader.ignored.summarise(report)
     network = Network(
         name=name or path.name.partition(".")[0],
         source=str(path),

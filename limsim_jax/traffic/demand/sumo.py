@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, LaneMap, bucket, lane_rows
 from limsim_jax.maps.network import Lane, MapError, Network
 from limsim_jax.maps.routing import RouteTable, build_fixed_routes, build_routes
-from limsim_jax.maps.sumo_demand import Demand, Flow, Vehicle, VehicleType
+from limsim_jax.maps.sumo.records import Demand, Flow, Vehicle, VehicleType
 from limsim_jax.traffic.demand.arrays import NEVER
 from limsim_jax.traffic.demand.sample import departure_place, entry_speed, typical_vehicles
 from limsim_jax.traffic.state import start_state
@@ -56,7 +56,7 @@ def sumo_scenario(
     Args:
       network: the map.
       lane_map: of that map; its routes are replaced, and the offsets of its signal programs moved.
-      demand: from `maps.sumo_demand.read_demand`.
+      demand: from `maps.sumo.read_demand`.
       slots: vehicle slots of the world.
       begin: time of the files at which the scenario starts, s; default: that of the first departure.
       end: s; nobody departs from then on.
