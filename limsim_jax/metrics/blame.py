@@ -241,81 +241,102 @@ def responsibility(
     return jnp.where(other, two, one)
 
 
-def contact_update(
-    carry: ContactCarry,
-    *,
-    t: Float[Array, ""],
-    e: Encounter,
-    begin: Float[Array, " N"],
-    cease: Float[Array, " N"],
-    there: Bool[Array, " N"],
-    v: Float[Array, ""],
-    v_others: Float[Array, " N"],
-    changing: Bool[Array, ""],
-    others_changing: Bool[Array, " N"],
-    violation: Bool[Array, ""],
-    other_violations: Bool[Array, " N"],
-    rear_axle: Float[Array, ""],
-    b_max: Float[Array, ""],
-    others_b_max: Float[Array, " N"],
-) -> ContactCarry:
-    """One step of one ego among `N` others (`there`: not the ego itself, not an empty slot).
+class ContactStep(NamedTuple):
+    """A step of one ego among `N` others, for `contact_update`."""
 
-    `begin`, `cease`: `safety.contact_interval` of `e`. A slot must be seen empty before another vehicle
-    counts as new in it. The rear axle of the others is taken to be where the ego's is.
+    t: Float[Array, ""]  # s
+    e: Encounter  # [N]
+    begin: Float[Array, " N"]  # s from now, `safety.contact_interval` of `e`
+    cease: Float[Array, " N"]
+    there: Bool[Array, " N"]  # not the ego itself, not an empty slot
+    v: Float[Array, ""]  # m/s
+    v_others: Float[Array, " N"]
+    changing: Bool[Array, ""]  # in several lanes, or off the drivable area
+    others_changing: Bool[Array, " N"]
+    violation: Bool[Array, ""]  # drives where another one has priority
+    other_violations: Bool[Array, " N"]
+    rear_axle: Float[Array, ""]  # m, from the centre of the body back to the axle
+    b_max: Float[Array, ""]  # m/s^2, hardest braking
+    others_b_max: Float[Array, " N"]
+
+
+def contact_update(carry: ContactCarry, step: ContactStep) -> ContactCarry:
+    """One step.
+
+    A slot must be seen empty before another vehicle counts as new in it. The rear axle of the others is
+    taken to be where the ego's is.
     """
-    v_ego = jnp.broadcast_to(v, there.shape)
-    hazard = there & (first_touch(begin, cease) <= HAZARD)
-    onset = (
-        avoidable_by_braking(e, v, b_max),
-        avoidable_by_braking(mirrored(e), v_others, others_b_max),
-        jnp.broadcast_to(changing, there.shape),
-        others_changing,
-    )
-    fresh = sum((jnp.where(flag, 1 << k, 0) for k, flag in enumerate(onset)), jnp.zeros_like(carry.notes))
-    goes_on = (carry.notes & _HAZARD) > 0
-    touching = there & (begin <= 0) & (cease >= 0)
+    there = step.there
+    touching = there & (step.begin <= 0) & (step.cease >= 0)
     new = touching & ~carry.touched
-    notes = jnp.where(goes_on, carry.notes, fresh) & (_HAZARD - 1)
-    notes |= jnp.where(hazard, _HAZARD, 0)
-    notes |= jnp.where(there & (touching | carry.touched), _TOUCHED, 0)
-
-    fault = at_fault(contact_type(e, v_ego, v_others, rear_axle), changing)
-    severity = delta_v(v_ego, v_others, e.cos)
+    v_ego = jnp.broadcast_to(step.v, there.shape)
+    fault = at_fault(contact_type(step.e, v_ego, step.v_others, step.rear_axle), step.changing)
+    severity = delta_v(v_ego, step.v_others, step.e.cos)
+    notes = _notes(carry, step, touching)
+    worst = _worst(new, fault, severity)
+    kind, blame = _judged(notes, step, worst)
     number = jnp.sum(new, dtype=jnp.int32)
     faults = jnp.sum(new & fault, dtype=jnp.int32)
-    # the worst of contacts in one step, by a key: at fault first, then the hardest, then the slot
-    slots = jnp.arange(there.shape[0], dtype=jnp.int32)
-    rank = (severity * _SEVERITY).astype(jnp.int32) + jnp.where(fault, 2**13, 0)
-    worst = jnp.max(jnp.where(new, rank * _SLOTS + slots, 0)) % _SLOTS
-    pair: Encounter = jax.tree.map(lambda x: x[worst], e)
-    kind = contact_type(pair, v, v_others[worst], rear_axle)
-    other_kind = contact_type(mirrored(pair), v_others[worst], v, rear_axle)
-    began = Onset(*((notes[worst] & (1 << k)) > 0 for k in range(4)))
-    blame = responsibility(
-        kind=kind,
-        other_kind=other_kind,
-        violation=violation,
-        other_violation=other_violations[worst],
-        onset=began._replace(
-            changing=began.changing | changing,
-            other_changing=began.other_changing | others_changing[worst],
-        ),
-    )
     first = (number > 0) & (carry.contacts == 0)
     return ContactCarry(
         notes=notes,
         contacts=carry.contacts + number,
         faults=carry.faults + faults,
         fault_now=faults > 0,
-        time=jnp.where(first, t, carry.time),
+        time=jnp.where(first, step.t, carry.time),
         other=jnp.where(first, worst, carry.other),
         kind=jnp.where(first, kind, carry.kind),
-        fault=jnp.where(first, at_fault(kind, changing), carry.fault),
+        fault=jnp.where(first, at_fault(kind, step.changing), carry.fault),
         responsibility=jnp.where(first, blame, carry.responsibility),
         severity=jnp.where(first, severity[worst], carry.severity),
         most_severe=jnp.maximum(carry.most_severe, jnp.max(jnp.where(new, severity, 0))),
     )
+
+
+def _notes(carry: ContactCarry, step: ContactStep, touching: Bool[Array, " N"]) -> Int[Array, " N"]:
+    """The notes after a step: how each hazard began, whether it goes on, contacts since entry."""
+    there = step.there
+    hazard = there & (first_touch(step.begin, step.cease) <= HAZARD)
+    onset = (
+        avoidable_by_braking(step.e, step.v, step.b_max),
+        avoidable_by_braking(mirrored(step.e), step.v_others, step.others_b_max),
+        jnp.broadcast_to(step.changing, there.shape),
+        step.others_changing,
+    )
+    fresh = sum((jnp.where(flag, 1 << k, 0) for k, flag in enumerate(onset)), jnp.zeros_like(carry.notes))
+    goes_on = (carry.notes & _HAZARD) > 0
+    notes = jnp.where(goes_on, carry.notes, fresh) & (_HAZARD - 1)
+    notes |= jnp.where(hazard, _HAZARD, 0)
+    return notes | jnp.where(there & (touching | carry.touched), _TOUCHED, 0)
+
+
+def _worst(new: Bool[Array, " N"], fault: Bool[Array, " N"], severity: Float[Array, " N"]) -> Int[Array, ""]:
+    """Slot of the worst new contact in a step: at fault first, then the hardest, then the last slot."""
+    slots = jnp.arange(new.shape[0], dtype=jnp.int32)
+    rank = (severity * _SEVERITY).astype(jnp.int32) + jnp.where(fault, 2**13, 0)
+    return jnp.max(jnp.where(new, rank * _SLOTS + slots, 0)) % _SLOTS
+
+
+def _judged(
+    notes: Int[Array, " N"], step: ContactStep, worst: Int[Array, ""]
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """`ContactType` and `Responsibility` of a contact with the vehicle in slot `worst`."""
+    v, v_other = step.v, step.v_others[worst]
+    pair: Encounter = jax.tree.map(lambda x: x[worst], step.e)
+    kind = contact_type(pair, v, v_other, step.rear_axle)
+    other_kind = contact_type(mirrored(pair), v_other, v, step.rear_axle)
+    began = Onset(*((notes[worst] & (1 << k)) > 0 for k in range(4)))
+    blame = responsibility(
+        kind=kind,
+        other_kind=other_kind,
+        violation=step.violation,
+        other_violation=step.other_violations[worst],
+        onset=began._replace(
+            changing=began.changing | step.changing,
+            other_changing=began.other_changing | step.others_changing[worst],
+        ),
+    )
+    return kind, blame
 
 
 def contact_result(carry: ContactCarry) -> dict[str, Measured]:

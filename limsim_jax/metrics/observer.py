@@ -15,9 +15,10 @@ from jaxtyping import Array, Bool, Float, Int
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, width
 from limsim_jax.maps.signals import SignalState, lane_states
-from limsim_jax.metrics.episode import EgoCarry, EgoMetrics, EgoStep
+from limsim_jax.metrics.ego import EgoCarry, EgoMetrics
 from limsim_jax.metrics.reductions import Measured
 from limsim_jax.metrics.safety import NO_GAP, Rss, Zones
+from limsim_jax.metrics.step import EgoStep
 from limsim_jax.metrics.traffic import Detectors, TrafficCarry, TrafficMetrics, TrafficStep
 from limsim_jax.traffic.collision import CLEARANCE, level, off_road
 from limsim_jax.traffic.ego import arrived, body_place

@@ -112,34 +112,29 @@ class NuPlanScore(NamedTuple):
     comfort: Scalar
 
 
-def nuplan_score(
-    *,
-    at_fault: Number,
-    off_road: Bool[Array, "*b"],
-    against_flow: Scalar,
-    progress: Scalar,
-    reference_progress: Scalar,
-    ttc_within_bound: Bool[Array, "*b"],
-    overspeed: Scalar,
-    duration: Scalar,
-    comfortable: Bool[Array, "*b"],
-    at_fault_vru: Number = 0,
-    at_fault_object: Number = 0,
-) -> NuPlanScore:
+class NuPlanEpisode(NamedTuple):
+    """What nuPlan's score needs to know of an episode."""
+
+    at_fault: Number  # contacts with vehicles by the ego's fault
+    off_road: Bool[Array, "*b"]  # a corner of the ego was more than 0.3 m outside the drivable area
+    against_flow: Scalar  # m, the most driven against the flow of the lane within a second
+    progress: Scalar  # m along the route
+    reference_progress: Scalar  # m, of the driver that the ego is compared with
+    ttc_within_bound: Bool[Array, "*b"]  # `nuplan_ttc` held at every step
+    overspeed: Scalar  # m, integral of the excess over the limit
+    duration: Scalar  # s
+    comfortable: Bool[Array, "*b"]  # all quantities within `motion.COMFORT`
+    at_fault_vru: Number = 0  # contacts at fault with pedestrians and cyclists
+    at_fault_object: Number = 0  # with cones and the like
+
+
+def nuplan_score(episode: NuPlanEpisode) -> NuPlanScore:
     """nuPlan's closed-loop score of one episode.
 
-    Args:
-        at_fault: Contacts with vehicles by the ego's fault; none is allowed, nor with `at_fault_vru`
-            (pedestrians, cyclists); one with an `at_fault_object` (cones and the like) costs half.
-        off_road: A corner of the ego was more than 0.3 m outside the drivable area.
-        against_flow: m, the most that it drove against the flow of its lane within a second.
-        progress: m along the route.
-        reference_progress: m, of whom it is compared with.
-        ttc_within_bound: `nuplan_ttc` held at every step.
-        overspeed: m, integral of the excess over the limit.
-        duration: s.
-        comfortable: All quantities within `motion.COMFORT`.
+    No contact at fault is allowed with vehicles, pedestrians or cyclists; one with an object costs half.
     """
+    progress, reference_progress = episode.progress, episode.reference_progress
+    against_flow = episode.against_flow
 
     def collisions(count: Number, allowed: int) -> Scalar:
         count = jnp.broadcast_to(jnp.asarray(count, progress.dtype), progress.shape)
@@ -150,16 +145,17 @@ def nuplan_score(
     ratio = jnp.where(progress < -floor, 0, jnp.minimum(ratio, 1))
     compliance, violation = NUPLAN_DIRECTION
     direction = jnp.where(against_flow < compliance, 1.0, jnp.where(against_flow < violation, 0.5, 0.0))
-    no_collisions = collisions(at_fault, 0) * collisions(at_fault_vru, 0) * collisions(at_fault_object, 1)
-    excess = safe_divide(overspeed, NUPLAN_OVERSPEED * duration)
+    no_collisions = collisions(episode.at_fault, 0) * collisions(episode.at_fault_vru, 0)
+    no_collisions = no_collisions * collisions(episode.at_fault_object, 1)
+    excess = safe_divide(episode.overspeed, NUPLAN_OVERSPEED * episode.duration)
     parts = {
         "progress": ratio,
-        "ttc": ttc_within_bound.astype(ratio.dtype),
+        "ttc": episode.ttc_within_bound.astype(ratio.dtype),
         "speed_limit": jnp.maximum(1 - excess, 0),
-        "comfort": comfortable.astype(ratio.dtype),
+        "comfort": episode.comfortable.astype(ratio.dtype),
     }
     weighted = sum((weight * parts[name] for name, weight in NUPLAN_WEIGHTS.items()), jnp.zeros_like(ratio))
-    drivable = (~off_road).astype(ratio.dtype)
+    drivable = (~episode.off_road).astype(ratio.dtype)
     making_progress = (ratio > least_ratio).astype(ratio.dtype)
     product = no_collisions * drivable * direction * making_progress
     score = product * weighted / sum(NUPLAN_WEIGHTS.values())
@@ -331,45 +327,28 @@ def limsim_init() -> LimSimCarry:
     )
 
 
-def limsim_update(
-    dt: float,
-    carry: LimSimCarry,
-    filtered: Filtered,
-    *,
-    t: Float[Array, ""],
-    a: Float[Array, ""],
-    lateral: Float[Array, ""],
-    v: Float[Array, ""],
-    v_others: Float[Array, ""],
-    others: Bool[Array, ""],
-    limit: Float[Array, ""],
-    ttc: Float[Array, ""],
-    red_light: Bool[Array, ""],
-    in_junction: Bool[Array, ""],
-    waits_at_red: Bool[Array, ""],
-) -> LimSimCarry:
-    """One step; the first call sets the start. A second that is not full at the end does not count.
+class LimSimStep(NamedTuple):
+    """A step of the ego, for `limsim_update`."""
 
-    `t`: s, now. `a`, `lateral`: m/s^2 along and across, unfiltered. `v_others`: mean speed of the cars on
-    the same road or on the next lane, if there are `others`; `limit`: m/s; `ttc`: s, least; `red_light`:
-    crosses a stop line on red in this step; `waits_at_red`: stands within 15 m of one.
-    """
-    counts = carry.started
-    old = carry.second
-    now = jnp.stack([a, lateral])
+    t: Float[Array, ""]  # s
+    a: Float[Array, ""]  # m/s^2, along, unfiltered
+    lateral: Float[Array, ""]  # m/s^2, across, unfiltered
+    v: Float[Array, ""]  # m/s
+    v_others: Float[Array, ""]  # m/s, mean of the cars on the same road or on the next lane
+    others: Bool[Array, ""]  # there are some
+    limit: Float[Array, ""]  # m/s
+    ttc: Float[Array, ""]  # s, least
+    red_light: Bool[Array, ""]  # crosses a stop line on red in this step
+    in_junction: Bool[Array, ""]
+    waits_at_red: Bool[Array, ""]  # stands within 15 m of a red light
+
+
+def limsim_update(dt: float, carry: LimSimCarry, filtered: Filtered, step: LimSimStep) -> LimSimCarry:
+    """One step; the first call sets the start. A second that is not full at the end does not count."""
+    counts, limit, a = carry.started, step.limit, step.a
+    now = jnp.stack([a, step.lateral])
     begin = jnp.where(counts, carry.begin, now)
-    second = LimSimSecond(
-        steps=old.steps + 1,
-        acceleration=old.acceleration + a,
-        lateral=old.lateral + lateral,
-        v=old.v + v,
-        v_others=old.v_others.add(v_others, others),
-        ttc=jnp.minimum(old.ttc, ttc),
-        fastest=jnp.maximum(old.fastest, v),
-        red=old.red | red_light,
-        waits=waits_at_red,
-    )
-    second = _where(counts, second, old)
+    second = _where(counts, _with_step(carry.second, step), carry.second)
 
     full = counts & (second.steps == round(1 / dt))
     steps = jnp.maximum(second.steps, 1).astype(a.dtype)
@@ -379,7 +358,7 @@ def limsim_update(
     efficiency = limsim_efficiency(second.v / steps, around.value, around.valid, limit)
     corrected = jnp.where(second.waits, 1, efficiency)
     safety = jnp.minimum(second.ttc / LIMSIM_TTC, 1)
-    over = second.fastest > limit + OVER_LIMIT
+    over, over_now = (v > limit + OVER_LIMIT for v in (second.fastest, step.v))
     mean_comfort = jnp.mean(jnp.stack(comfort))
     score = 100 * (0.25 * mean_comfort + 0.25 * corrected + 0.5 * safety)
 
@@ -388,15 +367,29 @@ def limsim_update(
         started=jnp.ones((), bool),
         begin=jnp.where(full, now, begin),
         second=_where(full, _no_second(), second),
-        worst=carry.worst.add(score, t, full),
+        worst=carry.worst.add(score, step.t, full),
         comfort=carry.comfort.add(mean_comfort, full),
         efficiency=carry.efficiency.add(efficiency, full),
         corrected_efficiency=carry.corrected_efficiency.add(corrected, full),
         safety=carry.safety.add(safety, full),
         speeding=carry.speeding.add(over.astype(a.dtype), full),
-        reds=carry.reds + (full & second.red & in_junction).astype(jnp.int32),
-        corrected_speeding=carry.corrected_speeding.add((v > limit + OVER_LIMIT).astype(a.dtype), counts),
-        corrected_reds=carry.corrected_reds + red_light.astype(jnp.int32),
+        reds=carry.reds + (full & second.red & step.in_junction).astype(jnp.int32),
+        corrected_speeding=carry.corrected_speeding.add(over_now.astype(a.dtype), counts),
+        corrected_reds=carry.corrected_reds + step.red_light.astype(jnp.int32),
+    )
+
+
+def _with_step(old: LimSimSecond, step: LimSimStep) -> LimSimSecond:
+    return LimSimSecond(
+        steps=old.steps + 1,
+        acceleration=old.acceleration + step.a,
+        lateral=old.lateral + step.lateral,
+        v=old.v + step.v,
+        v_others=old.v_others.add(step.v_others, step.others),
+        ttc=jnp.minimum(old.ttc, step.ttc),
+        fastest=jnp.maximum(old.fastest, step.v),
+        red=old.red | step.red_light,
+        waits=step.waits_at_red,
     )
 
 

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from limsim_jax.metrics.description import Better, Description
 from limsim_jax.metrics.reductions import Least, Mean, Measured, measured
 from limsim_jax.numerics import safe_divide, safe_sqrt
 
@@ -39,20 +40,74 @@ HEADWAY_BIN = 0.5
 """s, width of the bins of the headway histogram; the last bin takes all that is longer."""
 
 
-NAMES = {
-    "mean_speed": "m/s, distance travelled by time spent",
-    "flow_per_hour": "vehicles per hour and lane",
-    "density_per_km": "vehicles per km of lane",
-    "vehicle_km": "km driven by all",
-    "delay_per_km": "s lost to others per km",
-    "delay_share": "share of the time lost to others",
-    "mean_queue": "vehicles slower than 5 km/h",
-    "max_queue": "most of them at once",
-    "lane_changes_per_km": "lane changes per km driven",
-    "trips": "vehicles that reached their goals",
-    "mean_travel_time": "s, of those",
-    "sd_travel_time": "s, standard deviation",
-}
+def _column(
+    name: str,
+    meaning: str,
+    better: Better,
+    formula: str,
+    missing: str = "",
+    *,
+    source: str = "",
+    plot: str = "",
+) -> Description:
+    name = f"traffic_{name}"
+    return Description(
+        name, meaning, "Traffic", better, formula=formula, source=source, missing=missing, plot=plot
+    )
+
+
+_EDIE = "Edie 1963"
+_STOOD = "No vehicle moved."
+_NO_TRIP = "No vehicle reached its goal."
+
+DESCRIPTIONS = (
+    _column(
+        "mean_speed", "m/s, distance travelled by time spent", "higher", "Distance travelled / time spent.",
+        "No vehicle was there.", source=_EDIE, plot="Mean speed of the traffic, m/s",
+    ),
+    _column(
+        "flow_per_hour", "vehicles per hour and lane", "higher",
+        "Distance travelled / (length of all lanes x time), per hour.", source=_EDIE,
+    ),
+    _column(
+        "density_per_km", "vehicles per km of lane", "neither",
+        "Time spent / (length of all lanes x time), per km.", source=_EDIE,
+    ),
+    _column("vehicle_km", "km driven by all", "neither", "Distance travelled by all vehicles, in km."),
+    _column(
+        "delay_per_km", "s lost to others per km", "lower",
+        "Time spent less that of the same distance at free speed, per km; free speed is the lesser of limit "
+        "and "
+        "desired speed.",
+        _STOOD,
+    ),
+    _column(
+        "delay_share", "share of the time lost to others", "lower", "That delay / time spent.",
+        "No vehicle was there.",
+    ),
+    _column(
+        "mean_queue", "vehicles slower than 5 km/h", "lower",
+        "Mean number of vehicles below 5 km/h, over steps."
+    ),
+    _column("max_queue", "most of them at once", "lower", "Greatest number of vehicles below 5 km/h in a "
+    "step."),
+    _column(
+        "lane_changes_per_km", "lane changes per km driven", "lower", "Lane changes / km driven by all.",
+        _STOOD
+    ),
+    _column("trips", "vehicles that reached their goals", "neither", "Vehicles that left at their goals."),
+    _column(
+        "mean_travel_time", "s, of those", "lower", "Mean time from entering to leaving, of trips.", _NO_TRIP
+    ),
+    _column(
+        "sd_travel_time", "s, standard deviation", "neither",
+        "Standard deviation of the travel times of trips.",
+        _NO_TRIP,
+    ),
+)  # fmt: skip
+"""The columns, in order."""
+
+NAMES = {column.name.removeprefix("traffic_"): column.meaning for column in DESCRIPTIONS}
 """What `TrafficMetrics.result` measures."""
 
 

@@ -26,7 +26,7 @@ from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.xml import file_hash
 from limsim_jax.metrics.blame import Responsibility
-from limsim_jax.metrics.episode import NAMES
+from limsim_jax.metrics.ego import NAMES
 from limsim_jax.metrics.observer import EvaluateEgo
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import NEAR_MISS, Rss

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from limsim_jax.metrics.blame import (
+    ContactStep,
     ContactType,
     Responsibility,
     ahead,
@@ -171,8 +172,7 @@ def episode(ego, others, steps, **flags):
         t, box, velocity, speed, changing, violation, absent = x
         e = encounter(box[0], velocity[0], box, velocity)
         begin, cease = contact_interval(e)
-        carry = contact_update(
-            carry,
+        record = ContactStep(
             t=t,
             e=e,
             begin=begin,
@@ -188,6 +188,7 @@ def episode(ego, others, steps, **flags):
             b_max=f(8.0),
             others_b_max=jnp.full(n, 8.0),
         )
+        carry = contact_update(carry, record)
         return carry, carry.fault_now
 
     xs = (f(np.arange(steps) * DT), f(np.array(boxes)), f(np.array(velocities)), speeds)

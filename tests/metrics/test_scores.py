@@ -8,6 +8,8 @@ from scipy.signal import savgol_filter
 
 from limsim_jax.metrics.motion import motion_flush, motion_init, motion_update
 from limsim_jax.metrics.scores import (
+    LimSimStep,
+    NuPlanEpisode,
     against_flow_init,
     against_flow_update,
     carla_score,
@@ -77,11 +79,11 @@ PERFECT = {
     ],
 )
 def test_nuplan_score(changes, score):
-    assert float(nuplan_score(**(PERFECT | changes)).score) == pytest.approx(score, rel=1e-5)
+    assert float(nuplan_score(NuPlanEpisode(**(PERFECT | changes))).score) == pytest.approx(score, rel=1e-5)
 
 
 def test_nuplan_parts():
-    found = nuplan_score(**(PERFECT | {"progress": f(60.0), "against_flow": f(3.0)}))
+    found = nuplan_score(NuPlanEpisode(**(PERFECT | {"progress": f(60.0), "against_flow": f(3.0)})))
     assert found._asdict() == pytest.approx(
         {
             "score": 0.5 * 13.5 / 16,
@@ -195,7 +197,7 @@ def judged(record, success=True, completion=1.0, failed=False):
         motion, limsim = carry
         t, heading, a, values = x
         motion, filtered = motion_update(DT, motion, t=t, v=values["v"], a=a, heading=heading)
-        limsim = limsim_update(DT, limsim, filtered, t=t, a=a, lateral=motion.lateral, **values)
+        limsim = limsim_update(DT, limsim, filtered, LimSimStep(t=t, a=a, lateral=motion.lateral, **values))
         return (motion, limsim), None
 
     @jax.jit

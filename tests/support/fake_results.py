@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from limsim_jax.metrics import episode
+from limsim_jax.metrics import ego
 from limsim_jax.metrics.blame import Responsibility
 from limsim_jax.sweep.store import MOMENTS, Results
 
-UNITS = episode.NAMES | {"traffic_collided": "vehicles that touched another", "traffic_mean_speed": "m/s"}
+UNITS = ego.NAMES | {"traffic_collided": "vehicles that touched another", "traffic_mean_speed": "m/s"}
 NAN = float("nan")
 ONE = ("highway", "like_traffic")
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from limsim_jax.metrics.blame import ContactType, Responsibility
-from limsim_jax.metrics.episode import NAMES, EgoMetrics, EgoStep
+from limsim_jax.metrics.ego import NAMES, EgoMetrics
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import NO_GAP, Zones
+from limsim_jax.metrics.step import EgoStep
 
 DT = 0.1
 LENGTH, WIDTH = 5.0, 2.0
@@ -73,7 +74,7 @@ def record(steps, ego, others=(), **changes) -> dict[str, Any]:
 
 
 def as_steps(r) -> EgoStep:
-    arrays = {
+    arrays: dict[str, Any] = {
         k: jnp.asarray(x, jnp.float32 if np.asarray(x).dtype == np.float64 else None) for k, x in r.items()
     }
     zones = Zones(arrays.pop("zone"), arrays.pop("zone_ego"), arrays.pop("zone_other"))

@@ -1,0 +1,76 @@
+"""What a column of results is: meaning, formula, source, and where a report shows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+Better = Literal["higher", "lower", "neither"]
+"""Which values are better."""
+
+Kind = Literal["mean", "proportion", "label", "rate"]
+"""How seeds are summed up: a mean, a share of 0 and 1, not at all (a slot, a type), events per distance."""
+
+Section = Literal["Drive and rules", "Safety", "Comfort", "Scores", "Traffic", "Own metrics"]
+"""Part of the report."""
+
+SECTIONS: tuple[Section, ...] = (
+    "Drive and rules",
+    "Safety",
+    "Comfort",
+    "Scores",
+    "Traffic",
+    "Own metrics",
+)
+"""In the order of the report."""
+
+
+class Headline(NamedTuple):
+    """A row of the short list of results."""
+
+    place: int  # in the list
+    label: str
+    statistic: Literal["estimate", "median"] = "estimate"
+    unit: str = ""
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Description:
+    """One column of results.
+
+    Attributes:
+      name: of the column.
+      meaning: unit and meaning; of a share of episodes "1 if ...".
+      section: part of the report.
+      better: which values are better.
+      kind: how seeds are summed up.
+      formula: how it is computed.
+      source: where the definition comes from; empty where it is this package's own.
+      missing: when an episode has no value, besides an ego that was never on the road.
+      headline: its row in the short list, or None.
+      plot: title of its distribution in the report; empty for none.
+      of: the column that a derived metric follows from; empty for columns.
+    """
+
+    name: str
+    meaning: str
+    section: Section
+    better: Better = "neither"
+    kind: Kind = "mean"
+    formula: str = ""
+    source: str = ""
+    missing: str = ""
+    headline: Headline | None = None
+    plot: str = ""
+    of: str = ""
+
+    @property
+    def sign(self) -> int:
+        """1 if higher values are better, -1 if lower ones are, 0 if neither."""
+        return {"higher": 1, "lower": -1, "neither": 0}[self.better]
+
+    @property
+    def share(self) -> bool:
+        """Whether it is 0 or 1 in every episode."""
+        return self.kind == "proportion"

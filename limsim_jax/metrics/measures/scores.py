@@ -1,0 +1,270 @@
+"""Driving scores of nuPlan, the CARLA leaderboard and LimSim++, as measures over an episode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from limsim_jax.metrics.blame import ahead, behind
+from limsim_jax.metrics.description import Better, Description, Headline, Kind
+from limsim_jax.metrics.measure import Derived, Measure, Summary
+from limsim_jax.metrics.reductions import Measured, measured
+from limsim_jax.metrics.scores import (
+    LimSimCarry,
+    LimSimStep,
+    Number,
+    NuPlanEpisode,
+    carla_score,
+    limsim_corrected,
+    limsim_faithful,
+    limsim_init,
+    limsim_update,
+    nuplan_score,
+    nuplan_ttc,
+)
+from limsim_jax.metrics.step import StepView
+from limsim_jax.numerics import safe_divide
+
+_NUPLAN_SHORT = "The episode is shorter than the filters of comfort."
+
+
+def _nuplan(
+    name: str, meaning: str, formula: str, kind: Kind = "mean", *, score: bool = False
+) -> Description:
+    return Description(
+        name, meaning, "Scores", "higher", kind, formula, "nuplan-devkit, closed-loop metric aggregator",
+        _NUPLAN_SHORT, Headline(10, "nuPlan score", unit="of 1") if score else None,
+        "nuPlan score" if score else "",
+    )  # fmt: skip
+
+
+class NuPlanCarry(NamedTuple):
+    """Memory of `NuPlan`."""
+
+    ttc_kept: Bool[Array, ""]
+    reference: Float[Array, ""]  # m, at the speed limit
+
+
+class NuPlan(Measure):
+    """nuPlan's closed-loop score and its parts."""
+
+    name = "nuplan"
+    columns = (
+        _nuplan(
+            "nuplan_score", "0 to 1",
+            "Product of the multipliers times the weighted mean of progress (5), ttc (5), speed_limit (4) "
+            "and "
+            "comfort (2).",
+            score=True,
+        ),
+        _nuplan(
+            "nuplan_no_at_fault_collisions", "0, 0.5 or 1, multiplier",
+            "0 with a contact at the ego's fault, else 1."
+        ),
+        _nuplan(
+            "nuplan_drivable_area", "0 or 1, multiplier", "0 if the ego was ever off the drivable area.",
+            "proportion"
+        ),
+        _nuplan(
+            "nuplan_driving_direction", "0, 0.5 or 1, multiplier",
+            "1 for against_flow below 2 m, 0.5 below 6 m, else 0."
+        ),
+        _nuplan(
+            "nuplan_making_progress", "0 or 1, multiplier", "1 if nuplan_progress is above 0.2.", "proportion"
+        ),
+        _nuplan(
+            "nuplan_progress", "0 to 1, weight 5",
+            "progress / that of the reference, at most 1; the reference drives at the speed limit for the "
+            "same time, "
+            "at most to the goal.",
+        ),
+        _nuplan(
+            "nuplan_ttc", "0 or 1, weight 5",
+            "1 if the TTC, on a grid of 0.1 s, never was 0.95 s or less to a vehicle ahead, or beside in a "
+            "junction "
+            "or a lane change.",
+            "proportion",
+        ),
+        _nuplan("nuplan_speed_limit", "0 to 1, weight 4", "1 - overspeed / (2.23 m/s x duration), at least "
+        "0."),
+        _nuplan("nuplan_comfort", "0 or 1, weight 2", "comfortable.", "proportion"),
+    )  # fmt: skip
+
+    def init(self, slots: int, zones: int) -> NuPlanCarry:
+        """Nothing broken."""
+        return NuPlanCarry(jnp.ones((), bool), jnp.zeros(()))
+
+    def update(self, carry: NuPlanCarry, step: StepView, derived: Derived) -> NuPlanCarry:
+        """Add the TTC of this step as nuPlan sees it, and the way of the reference."""
+        record, contacts = step.record, derived.contacts
+        e, (begin, cease) = step.encounter, step.contact_interval
+        sideways = (record.changing[step.slot] | record.in_junction) & ~behind(e, record.rear_axle)
+        watched = step.others & ~contacts.touched & (ahead(e, record.rear_axle) | sideways)
+        kept = jnp.all(nuplan_ttc(begin, cease, watched & record.relevant)) | (step.ego_speed <= 0.005)
+        kept &= ~contacts.fault_now
+        at_limit = jnp.where(step.drove, record.speed_limit * step.dt, 0)
+        return NuPlanCarry(carry.ttc_kept & kept, carry.reference + at_limit)
+
+    def result(self, carry: NuPlanCarry, summary: Summary) -> dict[str, Measured]:
+        """All columns."""
+        reference = summary.reference_progress
+        if reference is None:
+            reference = jnp.minimum(carry.reference, summary.route)
+        found = nuplan_score(
+            NuPlanEpisode(
+                at_fault=summary.faults,
+                off_road=summary.off_road,
+                against_flow=summary.against_flow,
+                progress=summary.progress,
+                reference_progress=reference,
+                ttc_within_bound=carry.ttc_kept,
+                overspeed=summary.overspeed,
+                duration=summary.duration,
+                comfortable=summary.comfortable.value > 0.5,
+            )
+        )
+        judged = summary.driven & summary.comfortable.valid
+        names = {name: "nuplan_score" if name == "score" else f"nuplan_{name}" for name in found._fields}
+        return {names[name]: measured(value, judged) for name, value in found._asdict().items()}
+
+
+class Carla(Measure):
+    """Driving score of the CARLA leaderboard 2.0."""
+
+    name = "carla"
+    columns = (
+        Description(
+            "carla_score", "0 to 100", "Scores", "higher",
+            formula="100 x completion x carla_penalty.",
+            source="CARLA leaderboard 2.0, statistics_manager.py",
+            missing="The ego was on the road for no full step.",
+            headline=Headline(11, "CARLA score", unit="of 100"),
+            plot="CARLA driving score",
+        ),
+        Description(
+            "carla_penalty", "0 to 1", "Scores", "higher",
+            formula="0.6 for each contact, 0.7 for each red light, 0.8 for each stop sign, times 1 - "
+            "off_route.",
+            source="CARLA leaderboard 2.0, statistics_manager.py",
+            missing="The ego was on the road for no full step.",
+        ),
+    )  # fmt: skip
+
+    def result(self, carry: tuple[()], summary: Summary) -> dict[str, Measured]:
+        """Both columns."""
+        counts: dict[str, Number] = {
+            "vehicles": summary.contacts,
+            "red_lights": summary.red_lights,
+            "stop_signs": summary.stop_signs,
+        }
+        outside = safe_divide(summary.off_route, summary.distance)
+        found = carla_score(summary.completion, counts, outside=outside)
+        return {
+            "carla_score": measured(found.score, summary.driven),
+            "carla_penalty": measured(found.penalty, summary.driven),
+        }
+
+
+_LIMSIM = "LimSim++, arXiv 2402.01246 and its released code; the driving score of arXiv 2502.09170"
+_NO_SECOND = "The episode has no full second; of the corrected version, it is shorter than the filters."
+_PARTS: dict[str, tuple[str, str]] = {
+    "total": ("0 to 100, drive score times completion", "limsim_{version}_drive x completion."),
+    "drive": (
+        "0 to 100",
+        "100 x (comfort / 4 + efficiency / 4 + safety / 2) x 0.7 per red light x 0.9^(10 x share of the "
+        "time with "
+        "speeding) x 0.6 on failure, as {version}: see limsim_jax.metrics.scores.",
+    ),
+    "comfort": ("0 to 1", "Mean score of accelerations and jerks, as {version}."),
+    "efficiency": ("0 to 1", "Speed over that of the traffic around, at most the limit, as {version}."),
+    "safety": ("0 to 1", "min(least TTC of a second / 5 s, 1), mean over seconds."),
+}
+
+
+def _limsim(version: str) -> list[Description]:
+    found = []
+    for part, (meaning, formula) in _PARTS.items():
+        main = part == "total" and version == "corrected"
+        found.append(
+            Description(
+                f"limsim_{version}_{part}", meaning, "Scores", "higher", "mean",
+                formula.format(version=version),
+                _LIMSIM, _NO_SECOND, Headline(12, "LimSim score, corrected", unit="of 100") if main else None,
+                "LimSim score, corrected" if main else "",
+            )
+        )  # fmt: skip
+    return found
+
+
+def _second(name: str, meaning: str, better: Better, formula: str) -> Description:
+    return Description(
+        name, meaning, "Scores", better, "mean", formula, _LIMSIM, "The episode has no full second."
+    )
+
+
+@dataclass(frozen=True)
+class LimSim(Measure):
+    """LimSim++'s score, as released and as corrected.
+
+    Attributes:
+      dt: s between steps.
+    """
+
+    dt: float
+
+    name = "limsim"
+    columns = (
+        *_limsim("faithful"),
+        *_limsim("corrected"),
+        _second(
+            "worst_second", "0 to 100, LimSim's score of the worst second, as corrected, without its factors",
+            "higher",
+            "Least 100 x (comfort / 4 + efficiency / 4 + safety / 2) of a second.",
+        ),
+        _second("worst_second_time", "s, when it ended", "neither", "Time of the last step of that second."),
+    )  # fmt: skip
+
+    def init(self, slots: int, zones: int) -> LimSimCarry:
+        """No second."""
+        return limsim_init()
+
+    def update(self, carry: LimSimCarry, step: StepView, derived: Derived) -> LimSimCarry:
+        """Add this step to the second that runs."""
+        record = step.record
+        return limsim_update(
+            self.dt,
+            carry,
+            derived.filtered,
+            LimSimStep(
+                t=step.time,
+                a=step.a,
+                lateral=derived.motion.lateral,
+                v=step.v,
+                v_others=record.v_others,
+                others=record.others,
+                limit=record.speed_limit,
+                ttc=step.least_ttc,
+                red_light=record.red_light,
+                in_junction=record.in_junction,
+                waits_at_red=record.waits_at_red,
+            ),
+        )
+
+    def result(self, carry: LimSimCarry, summary: Summary) -> dict[str, Measured]:
+        """All columns."""
+        completion = summary.completion
+        arrived = summary.arrived & (summary.contacts == 0)
+        failed = (summary.faults > 0) | summary.off_road
+        found = {
+            "faithful": limsim_faithful(carry, success=arrived, completion=completion),
+            "corrected": limsim_corrected(carry, summary.rest, failed=failed, completion=completion),
+        }
+        results = {
+            f"limsim_{version}_{part}": measured(getattr(score, part), score.valid)
+            for version, score in found.items()
+            for part in _PARTS
+        }
+        return results | {"worst_second": carry.worst.result(), "worst_second_time": carry.worst.when()}
