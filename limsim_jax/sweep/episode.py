@@ -26,11 +26,10 @@ from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.xml import file_hash
 from limsim_jax.metrics.blame import Responsibility
-from limsim_jax.metrics.ego import NAMES
+from limsim_jax.metrics.catalog import TOTALS, catalog
 from limsim_jax.metrics.observer import EvaluateEgo
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import NEAR_MISS, Rss
-from limsim_jax.metrics.traffic import NAMES as TRAFFIC_NAMES
 from limsim_jax.policies import POLICIES
 from limsim_jax.policies.base import Policy, build_policy, variants
 from limsim_jax.policies.predict import Replayed, constant_velocity
@@ -70,16 +69,7 @@ MOMENTS = ("contact", "off_road", "red_light", "near_miss", "hard_brake", "unsaf
 """Kinds of key moments, the worst first."""
 
 _MODELS = {"idm": car_following.IDM, "iidm": car_following.IIDM, "acc": car_following.ACC}
-_TOTALS = {
-    "entered": "vehicles, those of the start included",
-    "left": "vehicles that reached their goals",
-    "waiting": "vehicles still outside for want of room",
-    "full": "decisions at which somebody could not enter for want of a slot",
-    "collided": "vehicles that touched another, the ego included",
-    "ran_red": "vehicles that crossed a stop line on red",
-    "missed": "vehicles that took another goal for want of a gap to change lanes",
-    "gridlock": "1 if somebody got on less than 5 m in two minutes",
-}
+_TOTALS = tuple(total.name.removeprefix("traffic_") for total in TOTALS)
 _SHARE_OF_MEMORY = 0.25
 _TEMPORARIES = 12  # a world needs so many times the memory of its arrays while it runs
 _CHUNKS = {"cpu": 50, "gpu": 2000, "tpu": 2000}
@@ -97,11 +87,7 @@ class Replay(NamedTuple):
     metrics: dict[str, float]
 
 
-UNITS: dict[str, str] = (
-    NAMES
-    | {f"traffic_{name}": what for name, what in TRAFFIC_NAMES.items()}
-    | {f"traffic_{name}": what for name, what in _TOTALS.items()}
-)
+UNITS: dict[str, str] = {column.name: column.meaning for column in catalog()}
 """What every column means."""
 
 
