@@ -49,7 +49,7 @@ from limsim_jax.traffic.neighbors import (
     place_of,
     sort_vehicles,
 )
-from limsim_jax.traffic.right_of_way import give_way, rows_ahead
+from limsim_jax.traffic.right_of_way import approaches_ahead, give_way
 from limsim_jax.traffic.signals import switch
 from limsim_jax.types import Config, Schedule, State, Status
 from limsim_jax.xla import computed_once, mapped_like
@@ -154,17 +154,17 @@ def decide(
     choice = computed_once(choice)
     if traffic.lane_changes or command.meta is not None:
         state = start(lane_map, state, choice)
-    rows = rows_ahead(config, lane_map, state, ahead)
-    lights = switch(config, lane_map, state, rows.lane, rows.line)
-    yielding = give_way(lane_map, state, rows, own, lights)
-    state = replace(state, lights=lights, held=yielding.held, stopped=yielding.stopped)
+    approaches = approaches_ahead(config, lane_map, state, ahead)
+    lights = switch(config, lane_map, state, approaches.lane, approaches.line)
+    way = give_way(lane_map, state, approaches, own, lights)
+    state = replace(state, lights=lights, held=way.yielding, stopped=way.stopped)
     end = _lane_end(lane_map, state, ahead)
     # as far back as it can still stop for gently
     end = jnp.maximum(end - choice.stops_before, jnp.minimum(end, state.v * state.v / (2 * _GENTLY)))
-    wall = jnp.minimum(end, yielding.stop + state.driver.s0)
+    wall = jnp.minimum(end, way.stop + state.driver.s0)
     obstacles = Obstacles(
-        jnp.stack([own.lead, second.lead, yielding.lead, jnp.full_like(own.lead, -1)], -1),
-        jnp.stack([own.lead_gap, second.lead_gap, yielding.lead_gap, wall], -1),
+        jnp.stack([own.lead, second.lead, way.lead, jnp.full_like(own.lead, -1)], -1),
+        jnp.stack([own.lead_gap, second.lead_gap, way.lead_gap, wall], -1),
     )
     return state, Decision(
         obstacles=obstacles,

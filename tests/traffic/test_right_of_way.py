@@ -19,11 +19,11 @@ from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.signals import SignalState, phase_at
 from limsim_jax.simulation.rollout import Rollout, world_key
-from limsim_jax.traffic import right_of_way
 from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Command, Traffic, decide, drive
 from limsim_jax.traffic.motion import boxes
-from limsim_jax.traffic.right_of_way import Rows, travel_time
+from limsim_jax.traffic.right_of_way import Approaches, passage, travel_time
+from limsim_jax.traffic.right_of_way.stops import stops_at_lights
 from limsim_jax.traffic.signals import DETECTOR, GAP, switch
 from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import default_population
@@ -54,14 +54,14 @@ def random_sights(n, seed):
     v = rng.choice([0.0, 0.5, 4.0, 12.0], n) * rng.uniform(0.5, 1, n)
     slow = rng.uniform(3, 14, n)
     values = {
-        "y": rng.uniform(-40, 25, n), "length": rng.uniform(3, 12, n), "v": v, "slow": slow,
-        "fast": np.maximum(v, slow), "a": rng.uniform(0.8, 2.5, n), "brake": v * v / 8,
-        "wait": rng.choice([0.0, 2.0, 10.0, 40.0], n), "line": rng.uniform(-20, 40, n),
-        "stuck": rng.integers(0, 2, n) * 1.0, "held": rng.integers(0, 2, n) * 1.0,
-        "slows": rng.integers(0, 2, n) * 1.0,
-        "major": rng.choice([-1.0, 0.0, 1.0, 2.0], n), "slot": np.arange(n) * 1.0 + 1000 * seed,
+        "front": rng.uniform(-40, 25, n), "length": rng.uniform(3, 12, n), "v": v, "turn_speed": slow,
+        "top_speed": np.maximum(v, slow), "a": rng.uniform(0.8, 2.5, n), "brake": v * v / 8,
+        "waiting": rng.choice([0.0, 2.0, 10.0, 40.0], n), "line": rng.uniform(-20, 40, n),
+        "blocked": rng.integers(0, 2, n) * 1.0, "yielding": rng.integers(0, 2, n) * 1.0,
+        "slowing": rng.integers(0, 2, n) * 1.0,
+        "light": rng.choice([-1.0, 0.0, 1.0, 2.0], n), "slot": np.arange(n) * 1.0 + 1000 * seed,
     }  # fmt: skip
-    return right_of_way._Sight(**{name: jnp.asarray(x, jnp.float32) for name, x in values.items()})
+    return passage.Observed(**{name: jnp.asarray(x, jnp.float32) for name, x in values.items()})
 
 
 @pytest.mark.parametrize("merges", [False, True])
@@ -71,72 +71,75 @@ def test_of_two_vehicles_exactly_one_goes_first(merges):
     me, foe = random_sights(n, 1), random_sights(n, 2)
     start, length = rng.uniform(0, 15, (2, n)), rng.uniform(1, 12, (2, n))
     mine, theirs = (
-        right_of_way._Way(jnp.asarray(start[i], jnp.float32), jnp.asarray(start[i] + length[i], jnp.float32))
+        passage.Stretch(jnp.asarray(start[i], jnp.float32), jnp.asarray(start[i] + length[i], jnp.float32))
         for i in range(2)
     )
     gap = jnp.asarray(rng.uniform(0.5, 2, (2, n)), jnp.float32)
     prio, tie = (jnp.asarray(rng.integers(-1, 2, n), jnp.int32) for _ in range(2))
     kind = jnp.full(n, merges)
-    one = right_of_way._compare(me, mine, gap[0], foe, theirs, gap[1], prio, tie, kind)
-    other = right_of_way._compare(foe, theirs, gap[1], me, mine, gap[0], -prio, -tie, kind)
+    one = passage.compare(me, mine, gap[0], foe, theirs, gap[1], prio, tie, kind)
+    other = passage.compare(foe, theirs, gap[1], me, mine, gap[0], -prio, -tie, kind)
     free = jnp.zeros(n, bool)
     a, b = (jnp.asarray(rng.random(n) < 0.3) for _ in range(2))
     later, sooner = (jnp.asarray(rng.choice([0.0, 3.0, 1e3], n), jnp.float32) for _ in range(2))
     for x, y, kept in ((free, free, None), (a, b, None), (a, b, (later, sooner))):
-        first = right_of_way._goes_first(one, (x, y), kept)
-        second = right_of_way._goes_first(other, (y, x), kept and (kept[1], kept[0]))
+        first = passage.goes_first(one, (x, y), kept)
+        second = passage.goes_first(other, (y, x), kept and (kept[1], kept[0]))
         np.testing.assert_array_equal(np.asarray(first), ~np.asarray(second))
-    one = right_of_way._goes_first(one, (free, free))
+    one = passage.goes_first(one, (free, free))
     assert 0.3 < np.asarray(one).mean() < 0.7
     # who is on the stretch goes before who is not
-    on, off = np.asarray(mine.start - me.y) <= -0.5, np.asarray(theirs.start - foe.y) > np.asarray(foe.brake)
+    on, off = (
+        np.asarray(mine.start - me.front) <= -0.5,
+        np.asarray(theirs.start - foe.front) > np.asarray(foe.brake),
+    )
     assert np.asarray(one)[on & off].all() and (on & off).sum() > 100
 
 
 def meeting(me, foe, *, prio=1, **same):
     """Two vehicles before a crossing of their paths; whether the first goes first."""
     usual = {
-        "y": 0.0, "length": 4.5, "v": 0.0, "fast": 10.0, "slow": 10.0, "a": 1.5, "brake": 0.0, "wait": 0.0,
-        "line": 0.5, "stuck": 0.0, "held": 0.0, "slows": 0.0, "major": 0.0,
+        "front": 0.0, "length": 4.5, "v": 0.0, "top_speed": 10.0, "turn_speed": 10.0, "a": 1.5, "brake": 0.0,
+        "waiting": 0.0, "line": 0.5, "blocked": 0.0, "yielding": 0.0, "slowing": 0.0, "light": 0.0,
     }  # fmt: skip
     sights = [
-        right_of_way._Sight(**{k: jnp.float32(x) for k, x in (usual | own | {"slot": k}).items()})
+        passage.Observed(**{k: jnp.float32(x) for k, x in (usual | own | {"slot": k}).items()})
         for k, own in enumerate((me, foe))
     ]
     sights = [x._replace(brake=x.v * x.v / 8) for x in sights]
-    way = right_of_way._Way(jnp.float32(8.0), jnp.float32(16.0))
-    rivals = right_of_way._compare(
+    way = passage.Stretch(jnp.float32(8.0), jnp.float32(16.0))
+    rivals = passage.compare(
         sights[0], way, jnp.float32(1.5), sights[1], way, jnp.float32(1.5), jnp.int32(prio), jnp.int32(0),
         jnp.bool_(False),
     )  # fmt: skip
 
     def first(blocks=(False, False), kept=None):
         kept = None if kept is None else (jnp.float32(kept[0]), jnp.float32(kept[1]))
-        return bool(right_of_way._goes_first(rivals, (jnp.bool_(blocks[0]), jnp.bool_(blocks[1])), kept))
+        return bool(passage.goes_first(rivals, (jnp.bool_(blocks[0]), jnp.bool_(blocks[1])), kept))
 
     return first
 
 
 def test_who_has_priority_and_stands_is_passed_only_by_who_is_gone_before_it_can_go():
     """One that is held while lower streams pass must not be held by those that could only come later."""
-    stands = {"held": 1.0, "wait": 30.0}
-    far, near = {"y": -60.0, "v": 12.0, "fast": 12.0, "slow": 12.0}, {"y": -2.0, "v": 7.0}
+    stands = {"yielding": 1.0, "waiting": 30.0}
+    far, near = {"front": -60.0, "v": 12.0, "top_speed": 12.0, "turn_speed": 12.0}, {"front": -2.0, "v": 7.0}
     # nobody keeps it: it goes before all that can still stop, though it is held at the moment
     assert meeting(stands, far)() and meeting(stands, near)(kept=(0.0, 0.0))
     # others keep it for 3 s: who is near is gone by then, who is far is not
     assert not meeting(stands, near)(kept=(3.0, 0.0)) and meeting(stands, far)(kept=(3.0, 0.0))
     # kept by one that stands it comes at no known time: all that are not held themselves may pass
     assert not meeting(stands, far)(kept=(1e3, 0.0))
-    assert meeting(stands, near | {"held": 1.0, "v": 0.0})(kept=(1e3, 0.0))
+    assert meeting(stands, near | {"yielding": 1.0, "v": 0.0})(kept=(1e3, 0.0))
 
 
 def test_who_stands_where_others_cross_goes_before_who_can_still_wait():
-    inside, comes = {"line": -5.0, "held": 1.0}, {"y": -25.0, "v": 9.0}
+    inside, comes = {"line": -5.0, "yielding": 1.0}, {"front": -25.0, "v": 9.0}
     assert not meeting(inside, comes, prio=-1)() and meeting(inside, comes, prio=-1)(blocks=(True, False))
     assert not meeting(inside, comes, prio=-1)(blocks=(True, True))
     # but not before who can no longer stop, or only in haste
-    assert not meeting(inside, comes | {"y": 4.0, "v": 4.0}, prio=-1)(blocks=(True, False))
-    assert not meeting(inside, comes | {"y": 7.0}, prio=-1)(blocks=(True, False))
+    assert not meeting(inside, comes | {"front": 4.0, "v": 4.0}, prio=-1)(blocks=(True, False))
+    assert not meeting(inside, comes | {"front": 7.0}, prio=-1)(blocks=(True, False))
 
 
 def test_who_circulates_does_not_brake_hard_for_who_is_gone_before_it_comes():
@@ -159,7 +162,7 @@ def test_who_circulates_does_not_brake_hard_for_who_is_gone_before_it_comes():
 def rows_of(line, n):
     one = lambda x, dtype: jnp.asarray(np.stack([x, np.full(n, -1)], -1), dtype)  # noqa: E731
     zero = np.zeros(n)
-    return Rows(
+    return Approaches(
         one(zero, jnp.int32), one(zero, jnp.int32), one(-line - 1, jnp.float32), one(line, jnp.float32)
     )
 
@@ -176,7 +179,7 @@ def test_yellow_is_a_dilemma_that_the_braking_decides():
     shown = jnp.asarray(np.stack([since, since], -1), jnp.float32)
 
     def stops(light, state=state):
-        where, _ = right_of_way._lights(state, rows, speed, jnp.full(4, int(light)), shown)
+        where, _ = stops_at_lights(state, rows, speed, jnp.full(4, int(light)), shown)
         return np.asarray(where)[:, 0] < 1e5
 
     then = line + v * since
@@ -202,7 +205,7 @@ def test_yellow_is_a_dilemma_that_the_braking_decides():
     # who clears the junction goes before who has green from the side, but not before who still comes
     inside = rows._replace(line=jnp.full((n, 2), -3.0))
     for light, priority in ((SignalState.YELLOW, 0), (SignalState.RED, 2)):
-        _, major = right_of_way._lights(state, inside, speed, jnp.full(4, int(light)), shown)
+        _, major = stops_at_lights(state, inside, speed, jnp.full(4, int(light)), shown)
         assert (np.asarray(major) == priority).all()
 
 
@@ -219,7 +222,7 @@ def test_who_stops_at_yellow_goes_on_stopping():
         left = line - v * since + brake * since**2 / 2
         shown = jnp.asarray(np.stack([since, since], -1), jnp.float32)
         yellow = jnp.full(4, int(SignalState.YELLOW))
-        where, _ = right_of_way._lights(state, rows_of(left + 1e-3, n), speed, yellow, shown)
+        where, _ = stops_at_lights(state, rows_of(left + 1e-3, n), speed, yellow, shown)
         assert (np.asarray(where)[:, 0] < 1e5).all(), share
 
 

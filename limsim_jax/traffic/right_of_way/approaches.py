@@ -1,0 +1,66 @@
+"""The connectors that every vehicle comes to next."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap
+from limsim_jax.traffic.car_following import NO_GAP
+from limsim_jax.traffic.neighbors import Ahead
+from limsim_jax.types import Config, State
+
+APPROACHES = 3
+"""Connectors ahead that a vehicle looks at: the one it is on, and those it comes to."""
+
+
+class Approaches(NamedTuple):
+    """The next connectors of every vehicle, `R` of them."""
+
+    connector: Int[Array, "N R"]  # -1 where there is none
+    lane: Int[Array, "N R"]
+    x: Float[Array, "N R"]  # m, front bumper along the connector; negative before it
+    line: Float[Array, "N R"]  # m to the place to wait before the junction; negative once passed
+
+
+def approaches_ahead(config: Config, lane_map: LaneMap, state: State, ahead: Ahead) -> Approaches:
+    """The first connectors on the route of every vehicle, from its own lane on.
+
+    Args:
+      config: `look_ahead` limits how far away a connector may be.
+      lane_map: where.
+      state: the world.
+      ahead: the lanes that every vehicle will drive on.
+    """
+    table = lane_map.conflicts
+    connector = jnp.where(state.active[:, None], table.connector[ahead.lane], -1)
+    connector = jnp.where(ahead.start < config.look_ahead, connector, -1)
+    count = jnp.cumsum(connector >= 0, -1)
+    junction = lane_map.junction[ahead.lane]
+    setback = (lane_map.length - lane_map.stop_s)[ahead.lane]
+    found, line = [], jnp.full_like(state.s, -NO_GAP)
+    inside = jnp.full_like(state.lane, -1)
+    for r in range(APPROACHES):
+        here = (connector >= 0) & (count == r + 1)
+        index = jnp.argmax(here, -1)[:, None]
+        exists = here.any(-1)
+        pick = lambda x, i: jnp.take_along_axis(x, i, -1)[:, 0]  # noqa: E731
+        start, which = pick(ahead.start, index), pick(junction, index)
+        before = jnp.maximum(index - 1, 0)
+        enters = (index[:, 0] > 0) & (which >= 0) & (pick(junction, before) != which)
+        # the line of a junction holds for all its connectors; a vehicle inside has none
+        line = jnp.where(
+            enters, start - pick(setback, before), jnp.where((which >= 0) & (which == inside), line, -NO_GAP)
+        )
+        inside = which
+        found.append(
+            (
+                jnp.where(exists, pick(connector, index), -1),
+                jnp.where(exists, pick(ahead.lane, index), NO_LANE),
+                jnp.where(exists, -start, -NO_GAP),
+                jnp.where(exists, line, -NO_GAP),
+            )
+        )
+    return Approaches(*(jnp.stack(column, -1) for column in zip(*found, strict=True)))

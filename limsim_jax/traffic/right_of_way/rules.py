@@ -1,0 +1,103 @@
+"""The rules of the road at junctions, put together."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from limsim_jax.maps.lane_map import LaneMap, turn_speed
+from limsim_jax.maps.signals import lane_states
+from limsim_jax.traffic.car_following import NO_GAP
+from limsim_jax.traffic.neighbors import Pair
+from limsim_jax.traffic.parameters import JUNCTIONS
+from limsim_jax.traffic.right_of_way.approaches import APPROACHES, Approaches
+from limsim_jax.traffic.right_of_way.meet import meet
+from limsim_jax.traffic.right_of_way.passage import Observed
+from limsim_jax.traffic.right_of_way.stops import (
+    exit_full,
+    stop_signs,
+    stops_at_conflicts,
+    stops_at_lights,
+)
+from limsim_jax.types import Lights, State
+
+
+class RightOfWay(NamedTuple):
+    """What the right of way asks of every vehicle."""
+
+    stop: Float[Array, " N"]  # m to where the front bumper has to stop, NO_GAP if nowhere
+    lead: Int[Array, " N"]  # slot of a vehicle to follow through a merge or a split, -1 for none
+    lead_gap: Float[Array, " N"]  # m to it
+    yielding: Bool[Array, " N"]  # stands for the right of way, a sign or a full exit, not for a light
+    stopped: Bool[Array, " N"]  # has stopped at the stop sign ahead
+
+
+@jax.named_scope("right_of_way")
+def give_way(
+    lane_map: LaneMap, state: State, approaches: Approaches, own: Pair, lights: Lights
+) -> RightOfWay:
+    """Where every vehicle has to wait, and which it follows through merges and splits.
+
+    Args:
+      lane_map: where.
+      state: the world.
+      approaches: the connectors to come.
+      own: leader and follower on the own route.
+      lights: of the decision.
+    """
+    table, driver = lane_map.conflicts, state.driver
+    shows = jnp.asarray(lane_states(lane_map.signals, lights.phase))  # at the entry of every lane
+    n = state.lane.shape[0]
+    brake = state.v * state.v / (2 * JUNCTIONS.firm_braking)
+
+    speed = turn_speed(lane_map, approaches.lane, driver.a_lat[:, None])
+    since = lights.elapsed[lane_map.signals.lane_program[approaches.lane]]
+    at_light, light = stops_at_lights(state, approaches, speed, shows, since)
+    full = exit_full(lane_map, state, approaches, own)
+    stands = JUNCTIONS.standstill
+    standing = (own.lead >= 0) & (state.v[own.lead] < stands) & (state.v < stands)
+    queued = standing & (own.lead_gap < JUNCTIONS.queue_gap * driver.s0 + JUNCTIONS.queue_room)
+    starts = state.a > JUNCTIONS.starting
+    # stands for long and does not yield: whatever else it waits for
+    queued |= (state.v < stands) & (state.waiting > JUNCTIONS.tie_time) & ~state.held & ~starts
+    sign, stopped = stop_signs(lane_map, state, approaches)
+
+    def everywhere(x: Array) -> Array:
+        return jnp.broadcast_to(x[:, None] if x.ndim == 1 else x, (n, APPROACHES)).astype(jnp.float32)
+
+    a = jnp.maximum(driver.a, 0.5)  # m/s^2: times stay finite
+    observed = Observed(
+        front=approaches.x,
+        length=everywhere(state.shape.length),
+        v=everywhere(state.v),
+        top_speed=jnp.maximum(state.v[:, None], speed),
+        turn_speed=speed,
+        a=everywhere(a),
+        brake=everywhere(brake),
+        waiting=everywhere(state.waiting),
+        line=approaches.line,
+        blocked=everywhere((at_light < NO_GAP) | full | queued[:, None]),
+        yielding=everywhere(state.held),
+        slowing=everywhere(state.a < -JUNCTIONS.slowing),
+        light=light.astype(jnp.float32),
+        slot=everywhere(jnp.arange(n)),
+    )
+    if table.foe.shape[1]:
+        until, lead, lead_gap = meet(lane_map, state, approaches, observed)
+    else:  # a map where paths never meet
+        until = jnp.full((n, APPROACHES), NO_GAP, jnp.float32)
+        lead, lead_gap = jnp.full(n, -1, jnp.int32), jnp.full(n, NO_GAP, jnp.float32)
+    wait_s = table.wait_s[approaches.connector]
+    stop, waits = stops_at_conflicts(wait_s, approaches, observed.brake, until, sign | full)
+    yielding = state.active & waits.any(-1) & (state.v < stands)  # a vehicle that moves may yet come
+    stop = jnp.minimum(stop, at_light).min(-1)
+    return RightOfWay(
+        stop=jnp.where(state.active, stop, NO_GAP),
+        lead=lead,
+        lead_gap=lead_gap,
+        yielding=yielding,
+        stopped=stopped,
+    )
