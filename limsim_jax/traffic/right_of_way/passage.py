@@ -106,13 +106,11 @@ def compare(
       tie: the same by right before left.
       merges: whether the paths merge; otherwise they cross.
     """
+    margin = JUNCTIONS.margin
     my_distance, foe_distance = mine.start - me.front, theirs.start - foe.front
-    my_level = (my_distance <= -JUNCTIONS.margin).astype(jnp.int32) + (my_distance < me.brake).astype(
-        jnp.int32
-    )
-    foe_level = (foe_distance <= -JUNCTIONS.margin).astype(jnp.int32) + (foe_distance < foe.brake).astype(
-        jnp.int32
-    )
+    # 2: inside, 1: can no longer stop, 0: can wait
+    my_level = (my_distance <= -margin).astype(jnp.int32) + (my_distance < me.brake).astype(jnp.int32)
+    foe_level = (foe_distance <= -margin).astype(jnp.int32) + (foe_distance < foe.brake).astype(jnp.int32)
     my_arrival, foe_arrival = computed_once(
         (
             travel_time(my_distance, me.v, me.top_speed, me.a),
