@@ -132,7 +132,7 @@ def draw(
     """Draw a map: lanes with their direction, junctions, lights, stop lines."""
     window = None if bounds is None else _window(bounds)
     network = _load(file, no_cache)
-    from limsim_jax.maps.draw import draw_map
+    from limsim_jax.report.draw import draw_map
 
     draw_map(network, output, conflicts=conflicts, labels=labels, bounds=window)
     print(f"wrote {output}")

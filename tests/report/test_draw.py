@@ -17,8 +17,6 @@ from matplotlib.colors import to_hex, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from limsim_jax.maps import draw
-from limsim_jax.maps.draw import TRAFFIC_ZORDER, draw_map, draw_network
 from limsim_jax.maps.network import (
     Control,
     Crosswalk,
@@ -36,6 +34,9 @@ from limsim_jax.maps.network import (
     TrafficLight,
     Turn,
 )
+from limsim_jax.maps.outline import union
+from limsim_jax.report.draw import TRAFFIC_ZORDER, draw_map, draw_network
+from limsim_jax.report.draw.painter import CENTRE, EDGE
 
 REACH, BOX = 60.0, 12.0  # m, ends of the arms and half side of the junction
 
@@ -261,7 +262,7 @@ def test_marks_between_lanes_follow_the_permissions(crossing, arm, painted):
 
 def test_opposite_directions_are_parted_by_one_centre_line(crossing):
     marks = draw_network(_axes(), crossing)["marks"]
-    assert sum(len(lines) for color, lines in _lines(marks) if color == draw.CENTRE) == 4
+    assert sum(len(lines) for color, lines in _lines(marks) if color == CENTRE) == 4
 
 
 def test_a_sidewalk_does_not_hide_the_edge_of_the_carriageway(crossing):
@@ -275,7 +276,7 @@ def test_a_sidewalk_does_not_hide_the_edge_of_the_carriageway(crossing):
         for line in lines
         if np.allclose(line[:, 1], -3.5) and line[:, 0].min() >= BOX
     ]
-    assert shared == [draw.EDGE]
+    assert shared == [EDGE]
 
 
 def test_connectors_have_the_colour_of_their_turn(crossing):
@@ -342,7 +343,7 @@ def test_conflict_bands_lie_where_paths_cross(crossing):
 
 
 def test_spans_are_joined_where_they_overlap():
-    assert draw._joined([(4.0, 5.0), (0.0, 2.0), (1.0, 3.0), (3.0, 3.5)]) == [(0.0, 3.5), (4.0, 5.0)]
+    assert union([(4.0, 5.0), (0.0, 2.0), (1.0, 3.0), (3.0, 3.5)]) == [(0.0, 3.5), (4.0, 5.0)]
 
 
 def test_speed_signs_show_their_number(crossing):
@@ -527,5 +528,5 @@ def test_without_matplotlib_the_error_says_what_to_install(crossing, monkeypatch
 
 
 def test_the_module_loads_without_matplotlib():
-    code = "import sys, limsim_jax.maps.draw; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, limsim_jax.report.draw; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -14,6 +14,7 @@ from matplotlib.image import imread
 from PIL import Image
 
 from limsim_jax.maps.lane_map import absolute, lane_rows
+from limsim_jax.maps.outline import signal_bars
 from limsim_jax.maps.signals import SignalState
 from limsim_jax.report import video
 from limsim_jax.report.video import COLLIDED, EGO, SIGNALS, draw_frame, write_picture, write_video
@@ -102,7 +103,7 @@ def test_bars_of_one_lane_lie_as_its_turns_do():
     """Left, straight, right from left to right; none overlaps another."""
     network, lane_map, _ = small_trace("intersection")
     rows = lane_rows(network)
-    bars, behind = video._stop_bars(network, lane_map)
+    bars, behind = signal_bars(network, lane_map)
     rank = {"left": 0, "slight_left": 1, "straight": 2, "slight_right": 3, "right": 4}
     turn = {rows[m.via[0]]: rank[m.turn.name.lower()] for m in network.movements if m.via}
     shared = 0
