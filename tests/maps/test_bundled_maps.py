@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lxml import etree
+from mapbuilder import curves
 from paths import REPO
 
 from limsim_jax.maps.network import Action, Control, Lane, Network
@@ -94,14 +95,13 @@ def test_check_notices_a_changed_and_a_missing_file(tmp_path, monkeypatch, capsy
 
 def test_join_meets_any_pose():
     """Both shapes of connecting curve, against the pose that was asked for."""
-    module = generator()
     rng = np.random.default_rng(0)
     for _ in range(200):
-        a = module.Pose(*rng.uniform(-50, 50, 2), rng.uniform(-4, 4))
+        a = curves.Pose(rng.uniform(-50, 50), rng.uniform(-50, 50), rng.uniform(-4, 4))
         b = a.move(rng.uniform(15, 60), rng.uniform(-10, 10), rng.uniform(-1.2, 1.2))
-        end = module.join(a, b).end
+        end = curves.join(a, b).end
         assert math.hypot(end.x - b.x, end.y - b.y) < 3e-4  # pieces below 0.1 mm are left out
-        assert abs(module.wrap(end.heading - b.heading)) < 1e-5
+        assert abs(curves.wrap(end.heading - b.heading)) < 1e-5
 
 
 # ------------------------------------------------------------------------------ as our reader sees it

@@ -1,0 +1,1 @@
+"""Parts of `maps/generate.py`: curves, roads, junctions, and the OpenDRIVE writer."""
