@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,10 @@ import numpy as np
 from limsim_jax.maps import build_lane_map, bundled_map, read_network
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import Network
+from limsim_jax.maps.routing import default_goals
+from limsim_jax.traffic.demand import Demand, build_demand
 from limsim_jax.traffic.state import start_state
+from limsim_jax.traffic.vehicles import uniform_population
 from limsim_jax.types import Driver, Schedule, Shape, State
 
 
@@ -77,3 +81,32 @@ def no_arrivals(state: State) -> Schedule:
         time=jnp.full(1, 1e9), lane=zero - 1, s=jnp.zeros(1), v=jnp.zeros(1), goal=zero,
         driver=drivers(1), shape=shapes(1), start=jnp.zeros(1 + state.queues.next.shape[0], jnp.int32),
     )  # fmt: skip
+
+
+def demand_of(name, flows, population=None, horizon=3600.0, density=0.0) -> Demand:
+    """Demand on a bundled map; equal cars unless a population is given."""
+    population = uniform_population() if population is None else population
+    network, lane_map = bundled(name)
+    goals = default_goals(network)
+    return build_demand(network, lane_map, goals, flows, population, horizon=horizon, density=density)
+
+
+def _corners(box):
+    x, y, heading, length, width = box
+    c, s = math.cos(heading), math.sin(heading)
+    return np.array([
+        (x + a * length / 2 * c - b * width / 2 * s, y + a * length / 2 * s + b * width / 2 * c)
+        for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    ])  # fmt: skip
+
+
+def overlap(a, b) -> bool:
+    """Whether two boxes share a point: no edge of either separates their corners."""
+    p, q = _corners(a), _corners(b)
+    for shape in (p, q):
+        for i in range(4):
+            edge = shape[(i + 1) % 4] - shape[i]
+            normal = np.array([-edge[1], edge[0]])
+            if (p @ normal).max() < (q @ normal).min() or (q @ normal).max() < (p @ normal).min():
+                return False
+    return True

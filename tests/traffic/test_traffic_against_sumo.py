@@ -7,6 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 import numpy as np
+import platoon_against_sumo as platoons
 import pytest
 import traffic_against_sumo as referee
 from paths import SHARED, needs_shared
@@ -26,7 +27,7 @@ needs_sumo = pytest.mark.skipif(
 def test_a_platoon_drives_as_in_sumo():
     # a process of its own: SUMO keeps its world in globals
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        found = referee.one_lane(100.0, pool, vehicles=8)
+        found = platoons.one_lane(100.0, pool, vehicles=8)
     same = found["ballistic, as ours"]
     assert same["driven"] > 500  # across a lane end
     assert same["position_rms"] < 0.01
@@ -37,7 +38,7 @@ def test_a_platoon_drives_as_in_sumo():
 
 
 def test_platoon_stands_without_overlap():
-    cars = referee.platoon(20)
+    cars = platoons.platoon(20)
     gaps = cars.s[:-1] - cars.length[:-1] - cars.s[1:]
     assert (gaps > cars.s0[1:]).all()
     assert all(len(np.unique(x)) > 10 for x in vars(cars).values())
