@@ -13,30 +13,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from limsim_jax.maps.signals import SignalState
+from limsim_jax.policies.base import Policy
 from limsim_jax.policies.host import HostPolicy
-from limsim_jax.policies.reference import center_lane, reference_path, to_cartesian
-from limsim_jax.traffic.ego import Trajectory
+from limsim_jax.policies.reference import reference_path
 from limsim_jax.traffic.engine import Command
 
 
 @dataclass(frozen=True)
-class Cautious:  # policy = "my_package.drivers:Cautious"
+class Cautious(Policy):
     share: float = 0.8  # of the speed limit
-    free = True  # moves in the plane
-    others = 0
-
-    def init(self, config, lane_map, state):
-        return None
 
     def __call__(self, config, lane_map, state, memory, key):
         slot = state.egos.slot
-        lane, s = center_lane(lane_map, state, slot)  # of limsim_jax.policies.reference
-        way = reference_path(lane_map, lane, s, state.goal[slot], points=60, step=2.0)
-        v = jnp.minimum(state.v[slot], self.share * way.limit[:, 0])[:, None]
-        along = v * 0.2 * jnp.arange(16)[None]
-        place = to_cartesian(way, along, 0 * along)
-        now = config.time(state.step)
-        trajectory = Trajectory(x=place.x, y=place.y, heading=place.heading, v=v + 0 * along, t0=now, dt=0.2)
+        path = reference_path(lane_map, state, slot)
+        v = jnp.minimum(state.v[slot], self.share * path.limit[:, 0])[:, None]
+        s = v * 0.2 * jnp.arange(16.0)[None]  # m, in 3 s
+        trajectory = path.trajectory(s, v, t0=config.time(state.step), dt=0.2)
         return Command(trajectory=trajectory), memory
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.base import Policy
+from limsim_jax.policies.base import PolicyLike
 from limsim_jax.policies.pdm import PDMClosed
 from limsim_jax.policies.pdm.learned import (
     BEYOND,
@@ -84,7 +84,7 @@ class _Memory(NamedTuple):
 class _Recorder:
     """Drives as a policy does, and writes down what the network would see at every decision."""
 
-    driver: Policy
+    driver: PolicyLike
     decisions: int
 
     @property

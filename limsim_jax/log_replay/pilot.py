@@ -15,7 +15,7 @@ from limsim_jax.geometry import wrap_angle
 from limsim_jax.log_replay.scene import Scene
 from limsim_jax.log_replay.takeover import Ego, Flight, Moment
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, to_frenet
-from limsim_jax.policies.base import Policy
+from limsim_jax.policies.base import PolicyLike
 from limsim_jax.traffic.ego import Control, Limits, step_free, track
 from limsim_jax.traffic.engine import Command
 from limsim_jax.traffic.state import start_state
@@ -42,7 +42,7 @@ class PolicyPilot:
     """
 
     lane_map: LaneMap  # of the scene
-    policy: Policy = struct.field(pytree_node=False)  # whose egos move in the plane
+    policy: PolicyLike = struct.field(pytree_node=False)  # whose egos move in the plane
     decision_every: int = struct.field(pytree_node=False, default=5)  # moments of the log per decision
     limits: Limits = struct.field(pytree_node=False, default=Limits())  # of the ego
 

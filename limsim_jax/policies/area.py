@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.base import Policy, build_policy, variants
+from limsim_jax.policies.base import Policy, PolicyLike, renew_rows, variants
+from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.predict import Predictor
 from limsim_jax.traffic.ego import Egos, Trajectory, assign
 from limsim_jax.traffic.engine import Command
@@ -37,28 +38,24 @@ class Places(NamedTuple):
 
 
 @dataclass(frozen=True)
-class AreaOfInterest:
+class AreaOfInterest(Policy):
     """Drives the egos, and the vehicles around them that matter most, by planners.
 
     Attributes:
-      around: the planner of the vehicles around: a free policy, or its name and `options`.
+      around: the planner of the vehicles around; it moves them in the plane.
       ego: the planner of the egos; None: the same one.
       slots: vehicles beside the egos that can be planned for at a time.
       radius: m from the nearest ego, within which a vehicle gets a place.
       leave: m, beyond which it gives it up.
       dwell: s that it keeps a place at least; and as long as it is between two lanes.
-      options: arguments of `around` if that is a name.
     """
 
-    around: Policy | str = "limsim_tm"
-    ego: Policy | str | None = None
+    around: PolicyLike = field(default_factory=LimSimTM)
+    ego: PolicyLike | None = None
     slots: int = 8
     radius: float = 50.0
     leave: float | None = None
     dwell: float = 3.0
-    options: dict[str, Any] = field(default_factory=dict)
-
-    free = True
 
     def __post_init__(self) -> None:
         if self.slots < 1:
@@ -67,22 +64,25 @@ class AreaOfInterest:
             raise ValueError(f"radius: {self.radius} m; it has to be above 0")
         if self.leave is not None and self.leave < self.radius:
             raise ValueError(f"leave: {self.leave} m; not less than the radius of {self.radius} m")
-        around = _named(self.around, self.options)
-        if not around.free:
+        for name in ("around", "ego"):
+            if isinstance(getattr(self, name), str):
+                raise ValueError(f"{name}: a policy is expected, such as LimSimTM(), not a name")
+        if not self.around.free:
             raise ValueError("around: a policy that keeps to lanes; it needs one that moves in the plane")
-        object.__setattr__(self, "around", _with_others(around, self.slots))  # the last rows are not egos
-        if self.ego is not None:
-            object.__setattr__(self, "ego", _named(self.ego, {}))
-            object.__setattr__(self, "free", self.ego.free)  # pyright: ignore[reportAttributeAccessIssue]
 
-    def variants(self, seen: Predictor) -> dict[str, Policy]:
+    @property
+    def free(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the egos move in the plane; the vehicles around always do."""
+        return self.ego is None or self.ego.free
+
+    def variants(self, seen: Predictor) -> dict[str, PolicyLike]:
         """With a reference in the place of a module of the egos' planner; who is around keeps its own."""
-        policy = _named(self.around if self.ego is None else self.ego, {})
+        policy = self.around if self.ego is None else self.ego
         found = variants(_with_others(policy, 0), seen)
         return {name: replace(self, ego=other) for name, other in found.items()}
 
     @property
-    def others(self) -> int:
+    def others(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Vehicles beside the egos that can be planned for."""
         return self.slots
 
@@ -105,18 +105,20 @@ class AreaOfInterest:
         # who is new in a place has no memory
         begin, rows = self._begin(config, lane_map, state), self._split(fresh)
         inner = tuple(
-            jax.tree.map(lambda a, b: _rows_where(mine, a, b), new, old)  # noqa: B023
-            for mine, new, old in zip(rows, begin, places.inner, strict=True)
+            renew_rows(policy, mine, new, old)
+            for policy, mine, new, old in zip(self._policies(), rows, begin, places.inner, strict=True)
         )
         command, inner = self._drive(config, lane_map, state, inner, key)
         return replace(command, slot=slot), places._replace(inner=inner)
 
     def _parts(self, state: State) -> list[tuple[Any, State]]:
         """The policies, and the rows of egos that each of them drives."""
-        policies = [self.around] if self.ego is None else [self.ego, self.around]
-        return [
-            (p, replace(state, egos=egos)) for p, egos in zip(policies, self._split(state.egos), strict=True)
-        ]
+        rows = self._split(state.egos)
+        return [(p, replace(state, egos=egos)) for p, egos in zip(self._policies(), rows, strict=True)]
+
+    def _policies(self) -> list[Any]:
+        around = _with_others(self.around, self.slots)  # its last rows are not egos
+        return [around] if self.ego is None else [self.ego, around]
 
     def _split(self, rows: Any) -> list[Any]:
         """Arrays of all rows, as those of each policy."""
@@ -187,29 +189,11 @@ class AreaOfInterest:
         )
 
 
-def _named(policy: Policy | str, options: dict[str, Any]) -> Policy:
-    from limsim_jax.policies import POLICIES
-
-    if not isinstance(policy, str):
-        return policy
-    if policy not in POLICIES or policy == "area_of_interest":
-        known = ", ".join(name for name in POLICIES if name != "area_of_interest")
-        raise ValueError(f"unknown policy '{policy}'; known are {known}")
-    return build_policy(POLICIES[policy], options)
-
-
-def _with_others(policy: Policy, count: int) -> Policy:
+def _with_others(policy: PolicyLike, count: int) -> PolicyLike:
     """The policy for so many vehicles beside the egos, if it can drive any."""
     if is_dataclass(policy) and any(f.name == "others" for f in fields(policy)):
         return replace(policy, others=count)
     return policy
-
-
-def _rows_where(fresh: Bool[Array, " E"], new: Array, old: Array) -> Array:
-    """The new values in the rows that are `fresh`; what does not go by rows stays."""
-    if new.ndim and new.shape[0] == fresh.shape[0]:
-        return jnp.where(fresh.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
-    return old
 
 
 def _joined(first: Command, second: Command, egos: Egos) -> Command:

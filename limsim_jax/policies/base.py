@@ -1,49 +1,208 @@
-"""What a policy is: it looks at the world once per decision and commands the egos."""
+"""What a policy is: once per decision it looks at the world and commands the egos."""
 
 from __future__ import annotations
 
 import inspect
+import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
-from jaxtyping import Array, Key
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Key
 
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.predict import Predictor
 from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, State
 
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
 
-class Policy(Protocol):
-    """A pure function of the world with a memory of its own; written for one world."""
+
+@runtime_checkable
+class PolicyLike(Protocol):
+    """What the simulator asks of a policy; `Policy` is a base class with defaults."""
 
     @property
     def free(self) -> bool:
-        """Whether its egos move in the plane, by a trajectory or by controls, or keep to lanes."""
+        """Whether its egos move in the plane (by trajectories or controls); otherwise they keep to lanes."""
         ...
 
     @property
     def others(self) -> int:
-        """How many vehicles of the traffic it can drive at a time beside the egos: rows of `State.egos`."""
+        """Vehicles that it can drive at a time beside the egos: more rows of `State.egos`."""
         ...
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
-        """The memory at the start: any pytree, of the same shapes ever after."""
+        """The memory at the start: any pytree of arrays, whose shapes stay the same."""
         ...
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: Key[Array, ""]
     ) -> tuple[Command, Any]:
-        """What the egos do until the next decision, and the new memory. `key` is of this decision."""
+        """What the egos do until the next decision, and the new memory."""
         ...
 
 
-def build_policy(factory: Callable[..., Policy], options: Mapping[str, Any]) -> Policy:
+@dataclass(frozen=True, eq=False)
+class Policy(ABC):
+    """Base class of policies: a pure function of one world, with a memory of its own.
+
+    A policy of one's own needs `__call__` alone. Settings are fields of a frozen dataclass:
+
+        @dataclass(frozen=True)
+        class Cautious(Policy):
+            share: float = 0.8
+
+            def __call__(self, config, lane_map, state, memory, key):
+                ...
+                return Command(trajectory=trajectory), memory
+
+    Class attributes: `free`, whether egos move in the plane (otherwise they keep to lanes), and `others`, the
+    number of vehicles that it can drive beside the egos.
+
+    Attributes:
+      name: of the policy in results; None: that of the class, see `policy_name`.
+    """
+
+    name: str | None = field(default=None, kw_only=True)
+
+    free = True
+    others = 0
+    default_name: ClassVar[str | None] = None
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """The memory at the start, a pytree of arrays whose shapes stay the same; by default nothing."""
+        del config, lane_map, state
+
+    @abstractmethod
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: Key[Array, ""]
+    ) -> tuple[Command, Any]:
+        """What the egos do until the next decision, and the new memory.
+
+        Args:
+          config: steps and times of the simulation.
+          lane_map: the map.
+          state: the world now. Row k of `state.egos` is the k-th ego, `state.egos.slot[k]` its vehicle.
+          memory: what `init` or the call before returned.
+          key: random key of this decision.
+        """
+
+    def memory_rows(self, memory: Any) -> Any:
+        """Which arrays of the memory have one row per ego as their first axis: a tree of bools.
+
+        `AreaOfInterest` starts a row anew when it gets another vehicle. By default these are all arrays that
+        have an axis; scalars are shared by all egos.
+        """
+        return rows_by_axis(memory)
+
+
+def rows_by_axis(memory: Any) -> Any:
+    """`Policy.memory_rows` by default: every array with at least one axis."""
+    return jax.tree.map(lambda x: jnp.ndim(x) > 0, memory)
+
+
+@dataclass(frozen=True)
+class LikeTraffic(Policy):
+    """The egos drive as all traffic does: car following, lane changes, right of way."""
+
+    free = False
+
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
+    ) -> tuple[Command, Any]:
+        """No command."""
+        del config, lane_map, state, key
+        return Command(), memory
+
+
+# --- names -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Named(Policy):
+    """A policy that has no field `name`, under another name."""
+
+    policy: PolicyLike
+
+    @property
+    def free(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.policy.free
+
+    @property
+    def others(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return getattr(self.policy, "others", 0)
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        return self.policy.init(config, lane_map, state)
+
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
+    ) -> tuple[Command, Any]:
+        return self.policy(config, lane_map, state, memory, key)
+
+    def memory_rows(self, memory: Any) -> Any:
+        return memory_rows(self.policy, memory)
+
+    def variants(self, seen: Predictor) -> dict[str, PolicyLike]:
+        return variants(self.policy, seen)
+
+
+def policy_name(policy: Any) -> str:
+    """The name of a policy in tables and result folders.
+
+    Its attribute `name`; without one its class in snake case, such as `pdm_closed` for `PDMClosed`, or the
+    function of a `HostPolicy`.
+
+    Raises:
+      ValueError: a name with other characters than letters, digits, `_` and `-`.
+    """
+    kind = type(policy)
+    for name in (
+        getattr(policy, "name", None),
+        getattr(kind, "name", None),
+        getattr(policy, "default_name", None),
+    ):
+        if isinstance(name, str) and name:
+            return _checked_name(name)
+    return _checked_name(snake_case(kind.__name__))
+
+
+def named(name: str, policy: Any) -> Any:
+    """The same policy under another name, so that one sweep can have two settings of a planner.
+
+    Raises:
+      ValueError: a name with other characters than letters, digits, `_` and `-`.
+    """
+    _checked_name(name)
+    if is_dataclass(policy) and any(f.name == "name" and f.init for f in fields(policy)):
+        return replace(policy, name=name)  # pyright: ignore[reportArgumentType]
+    return _Named(policy, name=name)  # pyright: ignore[reportArgumentType]
+
+
+def snake_case(name: str) -> str:
+    """`PDMClosed` as `pdm_closed`."""
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_").lower() or "policy"
+
+
+def _checked_name(name: str) -> str:
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise ValueError(f"policy name {name!r}: only letters, digits, _ and -")
+    return name
+
+
+# --- what a policy offers, and whether it keeps to the rules -----------------------------------------
+
+
+def build_policy(factory: Callable[..., PolicyLike], options: Mapping[str, Any]) -> PolicyLike:
     """The policy that an experiment file describes.
 
     Raises:
-      ValueError: an option that there is not, or a value that makes no sense.
+      ValueError: an unknown option, or a value that makes no sense.
     """
     takes = inspect.signature(factory).parameters
     anything = any(x.kind is inspect.Parameter.VAR_KEYWORD for x in takes.values())
@@ -53,29 +212,118 @@ def build_policy(factory: Callable[..., Policy], options: Mapping[str, Any]) -> 
     return factory(**options)
 
 
-def variants(policy: Any, seen: Predictor) -> dict[str, Policy]:
-    """The policy with a reference in the place of one module, by what the module does; or nothing.
+def variants(policy: Any, seen: Predictor) -> dict[str, PolicyLike]:
+    """The policy with a reference in the place of one module, by what the module does.
 
-    That is asked for after a failure: a module is to blame if its reference would have avoided it. A policy
-    that is made of modules has a method of this name. `seen` predicts what came to pass.
+    After a failure each is asked for: a module is to blame if its reference would have avoided the failure. A
+    policy made of modules has a method `variants`; of others there are none. `seen` predicts what happened.
     """
     found = getattr(policy, "variants", None)
     return {} if found is None else found(seen)
 
 
-class LikeTraffic:
-    """The egos drive as all traffic does: car following, lane changes, right of way."""
+def memory_rows(policy: Any, memory: Any) -> Any:
+    """Which arrays of a policy's memory have one row per ego, see `Policy.memory_rows`."""
+    found = getattr(policy, "memory_rows", rows_by_axis)(memory)
+    return jax.tree.map(lambda mine, part: jax.tree.map(lambda _: mine, part), found, memory)
 
-    free = False
-    others = 0
 
-    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
-        """Nothing to remember."""
-        del config, lane_map, state
+def renew_rows(policy: Any, fresh: Bool[Array, " E"], new: Any, old: Any) -> Any:
+    """The memory of a policy, `new` in the rows that are `fresh`.
 
-    def __call__(
-        self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
-    ) -> tuple[Command, Any]:
-        """No command."""
-        del config, lane_map, state, key
-        return Command(), memory
+    Raises:
+      ValueError: an array that should have one row per ego has another number of them.
+    """
+    count = fresh.shape[0]
+
+    def one(by_row: bool, new: Array, old: Array) -> Array:
+        if not by_row:
+            return old
+        if new.shape[:1] != (count,):
+            raise ValueError(
+                f"{policy_name(policy)}: memory of shape {list(new.shape)} has no row for each of {count} "
+                "egos; memory_rows says which arrays have"
+            )
+        return jnp.where(fresh.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
+
+    return jax.tree.map(one, memory_rows(policy, new), new, old)
+
+
+def check_policy(policy: Any, config: Config, lane_map: LaneMap, state: State) -> None:
+    """Whether a policy keeps to the rules, found by tracing it once; nothing is compiled or run.
+
+    Exceptions of the policy itself pass unchanged.
+
+    Args:
+      policy: the policy.
+      config: of the experiment.
+      lane_map: arrays, or their shapes (`jax.ShapeDtypeStruct`).
+      state: of one world, with the rows of `egos` that the policy drives.
+
+    Raises:
+      ValueError: one line that names the class of the policy, what it returned and what is expected.
+    """
+    label = type(policy).__name__
+    if isinstance(policy, type):
+        raise ValueError(f"{policy.__name__}: a class, not a policy; expected {policy.__name__}()")
+    start = getattr(policy, "init", None)
+    if not (callable(policy) and callable(start)):
+        raise ValueError(f"{label}: a policy has methods init and __call__; derive it from limsim_jax.Policy")
+    if not isinstance(getattr(policy, "free", None), bool):
+        raise ValueError(f"{label}: free is {getattr(policy, 'free', None)!r}; a policy says True or False")
+
+    def begin(lane_map: LaneMap, state: State) -> Any:
+        memory = start(config, lane_map, state)
+        _check_arrays(label, "init", memory)
+        return memory
+
+    def decide(lane_map: LaneMap, state: State, memory: Any, key: Key[Array, ""]) -> Any:
+        found = policy(config, lane_map, state, memory, key)
+        if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[0], Command)):
+            raise ValueError(f"{label}: a policy returns (Command, memory), not {_kind(found)}")
+        _check_arrays(label, "the policy", found[1])
+        return found
+
+    memory = jax.eval_shape(begin, lane_map, state)
+    command, after = jax.eval_shape(decide, lane_map, state, memory, jax.random.key(0))
+    before, now = (jax.tree_util.tree_flatten_with_path(x) for x in (memory, after))
+    if before[1] != now[1]:
+        raise ValueError(f"{label}: memory changes its structure, from {before[1]} to {now[1]}")
+    for (path, old), (_, new) in zip(before[0], now[0], strict=True):
+        if (old.shape, old.dtype) != (new.shape, new.dtype):
+            place = jax.tree_util.keystr(path)
+            raise ValueError(f"{label}: memory{place} changes from {_shape(old)} to {_shape(new)}")
+    _check_command(label, command, state.egos.slot.shape[0])
+
+
+def _check_command(label: str, command: Command, count: int) -> None:
+    """Raise a `ValueError` if the arrays of a command have other shapes than one row per ego."""
+    if command.trajectory is not None:
+        x = command.trajectory.x
+        for name in ("x", "y", "heading", "v"):
+            value = getattr(command.trajectory, name)
+            if value.shape != x.shape or x.ndim != 2 or x.shape[0] != count or x.shape[1] < 2:
+                wanted = f"[{count} egos, 2 or more samples]"
+                raise ValueError(f"{label}: trajectory.{name} is {_shape(value)}; expected {wanted}")
+    parts = {"meta": command.meta, "signal": command.signal}
+    if command.control is not None:
+        parts |= {f"control.{x}": getattr(command.control, x) for x in ("acceleration", "steering")}
+    for name, value in parts.items():
+        if value is not None and value.shape != (count,):
+            raise ValueError(f"{label}: {name} is {_shape(value)}; expected [{count} egos]")
+
+
+def _check_arrays(label: str, where: str, memory: Any) -> None:
+    for leaf in jax.tree.leaves(memory):
+        if not hasattr(leaf, "dtype") and not isinstance(leaf, bool | int | float):
+            raise ValueError(f"{label}: {where} returns a memory with a {_kind(leaf)}; expected arrays")
+
+
+def _kind(found: Any) -> str:
+    if isinstance(found, tuple) and not hasattr(found, "_fields"):
+        return f"({', '.join(type(x).__name__ for x in found)})"
+    return type(found).__name__
+
+
+def _shape(x: Any) -> str:
+    return f"{x.dtype}{list(x.shape)}"

@@ -36,8 +36,9 @@ import numpy as np
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.policies.base import Policy, snake_case
 from limsim_jax.policies.predict import constant_velocity, nearest
-from limsim_jax.policies.reference import center_lane, reference_path
+from limsim_jax.policies.reference import reference_path
 from limsim_jax.traffic.ego import Control, Trajectory
 from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, State
@@ -105,10 +106,8 @@ class Observe:
             dx, dy = x - egos.x[:, None], y - egos.y[:, None]
             return cos * dx + sin * dy, cos * dy - sin * dx
 
-        lane, s = center_lane(lane_map, state, slot)
         goal = state.goal[slot]
-        after = jnp.where(lane == state.lane[slot], NO_LANE, state.lane[slot])
-        path = reference_path(lane_map, lane, s, goal, points=self.points, step=self.step, after=after)
+        path = reference_path(lane_map, state, slot, points=self.points, step=self.step)
         way_x, way_y = frame(path.x, path.y)
         now = constant_velocity(lane_map, state, jnp.zeros(1, state.v.dtype))
         near = nearest(lane_map, state, now, slot, self.nearest)
@@ -178,7 +177,7 @@ def _empty_road(seen: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class HostPolicy:
+class HostPolicy(Policy):
     """Egos driven by a function on the host.
 
     `function(seen)` gets what `observe` makes of all worlds, as NumPy arrays with a first axis `B`, and gives
@@ -209,9 +208,6 @@ class HostPolicy:
     observe: Callable[[Config, LaneMap, State], Any] = field(default_factory=Observe)
     samples: int = 41
     dt: float = 0.1
-    free: bool = field(init=False)
-
-    others = 0
 
     def __post_init__(self) -> None:
         if self.command not in get_args(Kind):
@@ -220,7 +216,16 @@ class HostPolicy:
             raise ValueError(f"memory: {self.memory} numbers; 0 or more")
         if self.samples < 2 or not self.dt > 0:
             raise ValueError(f"{self.samples} samples every {self.dt} s; 2 or more, and more than 0 s")
-        object.__setattr__(self, "free", self.command != "meta")
+
+    @property
+    def free(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether its egos move in the plane; with meta-actions they keep to lanes."""
+        return self.command != "meta"
+
+    @property
+    def default_name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The name of the function."""
+        return snake_case(getattr(self.function, "__name__", type(self.function).__name__))
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         """Zeros; tries the function first.

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, neighbor, pose, side_s, width
-from limsim_jax.traffic.ego import body_place
+from limsim_jax.traffic.ego import Trajectory, body_place
 from limsim_jax.traffic.motion import lateral_speed
 from limsim_jax.types import State
 from limsim_jax.xla import interval
@@ -40,6 +40,27 @@ class ReferencePath:
         """m from the first point to the last."""
         return self.step * (self.x.shape[-1] - 1)
 
+    def trajectory(
+        self,
+        s: Float[Array, "V H"],
+        v: Float[Array, "V _"],
+        t0: Float[Array, ""],
+        dt: float,
+        d: Float[Array, "V H"] | float = 0.0,
+    ) -> Trajectory:
+        """A trajectory along the path.
+
+        Args:
+          s: m along the path, of the centre of the body, at each sample.
+          v: m/s, at each sample or one for all.
+          t0: s, time of the first sample; `config.time(state.step)` is now.
+          dt: s between samples.
+          d: m left of the path.
+        """
+        place = to_cartesian(self, s, jnp.broadcast_to(jnp.asarray(d, s.dtype), s.shape))
+        v = jnp.broadcast_to(v, s.shape)
+        return Trajectory(x=place.x, y=place.y, heading=place.heading, v=v, t0=t0, dt=dt)
+
 
 class Frenet(NamedTuple):
     """Motion along and across a way, at its first point."""
@@ -54,7 +75,7 @@ class Frenet(NamedTuple):
     bend: Float[Array, " V"]  # 1/m, second derivative of d over s
 
 
-def reference_path(
+def path_from(
     lane_map: LaneMap,
     lane: Int[Array, " V"],
     s: Float[Array, " V"],
@@ -116,6 +137,23 @@ def reference_path(
         end=end,
         step=step,
     )
+
+
+def reference_path(
+    lane_map: LaneMap, state: State, slot: Int[Array, " V"], *, points: int = 60, step: float = 2.0
+) -> ReferencePath:
+    """Reference paths of the vehicles in these slots, along their routes.
+
+    Args:
+      lane_map: the map.
+      state: the world now.
+      slot: of the vehicles, such as `state.egos.slot`.
+      points: of each path.
+      step: m between points.
+    """
+    lane, s = center_lane(lane_map, state, slot)
+    after = jnp.where(lane == state.lane[slot], NO_LANE, state.lane[slot])
+    return path_from(lane_map, lane, s, state.goal[slot], points=points, step=step, after=after)
 
 
 def center_lane(lane_map: LaneMap, state: State, slot: Int[Array, " V"]) -> tuple[Array, Array]:

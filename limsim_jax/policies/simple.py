@@ -9,16 +9,17 @@ import jax
 import jax.numpy as jnp
 
 from limsim_jax.maps.lane_map import LaneMap, pose
+from limsim_jax.policies.base import Policy
 from limsim_jax.policies.perception import rules
-from limsim_jax.policies.reference import center_lane, reference_path, to_cartesian
-from limsim_jax.traffic.ego import Control, Trajectory
+from limsim_jax.policies.reference import center_lane, path_from
+from limsim_jax.traffic.ego import Control
 from limsim_jax.traffic.engine import Command, Traffic
 from limsim_jax.traffic.motion import accelerations
 from limsim_jax.types import Config, State
 
 
 @dataclass(frozen=True)
-class ConstantSpeed:
+class ConstantSpeed(Policy):
     """Steers along its route at one speed and minds nobody: how dangerous is it not to look?
 
     Steering by the pure-pursuit law (Coulter 1992, CMU-RI-TR-92-01): the arc through the point of the lane
@@ -31,9 +32,6 @@ class ConstantSpeed:
 
     speed: float | None = None
     look_ahead: float = 0.8
-
-    free = True
-    others = 0
 
     def __post_init__(self) -> None:
         if self.speed is not None and not self.speed >= 0:
@@ -74,7 +72,7 @@ class ConstantSpeed:
 
 
 @dataclass(frozen=True)
-class FollowLane:
+class FollowLane(Policy):
     """Drives in the plane what traffic drives on its lane: car following, right of way, no lane changes.
 
     For comparisons: whatever differs from `LikeTraffic` comes from moving in the plane.
@@ -87,12 +85,6 @@ class FollowLane:
     others: int = 0
     traffic: Traffic = field(default_factory=Traffic)
 
-    free = True
-
-    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
-        """Nothing to remember."""
-        del config, lane_map, state
-
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
     ) -> tuple[Command, Any]:
@@ -102,14 +94,11 @@ class FollowLane:
         _, decision = rules(config, self.traffic, lane_map, state, jnp.zeros_like(slot))
         a = accelerations(self.traffic.model, state, decision, jnp.zeros_like(state.s))[slot][:, None]
         lane, s = center_lane(lane_map, state, slot)
-        path = reference_path(lane_map, lane, s, state.goal[slot], points=45, step=2.0)
+        path = path_from(lane_map, lane, s, state.goal[slot], points=45, step=2.0)
         times = 0.2 * jnp.arange(11, dtype=jnp.float32)[None]
         v0, d0 = state.v[slot][:, None], state.d[slot][:, None]
         stops = jnp.where(a < 0, v0 / jnp.maximum(-a, 1e-3), 1e3)
         t = jnp.minimum(times, stops)
         along = v0 * t + a * t * t / 2
-        place = to_cartesian(path, along, d0 * jnp.exp(-along / 10.0))
-        trajectory = Trajectory(
-            x=place.x, y=place.y, heading=place.heading, v=v0 + a * t, t0=config.time(state.step), dt=0.2
-        )
-        return Command(trajectory=trajectory), memory
+        now, d = config.time(state.step), d0 * jnp.exp(-along / 10.0)
+        return Command(trajectory=path.trajectory(along, v0 + a * t, now, 0.2, d)), memory

@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Int, Key
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.base import LikeTraffic, Policy
+from limsim_jax.policies.base import LikeTraffic, PolicyLike
 from limsim_jax.simulation.totals import Stood, Totals, count, no_totals
 from limsim_jax.traffic.collision import collided
 from limsim_jax.traffic.demand import delayed
@@ -85,7 +85,7 @@ class Rollout:
     config: Config
     traffic: Traffic
     horizon: float
-    policy: Policy = field(default_factory=LikeTraffic)
+    policy: PolicyLike = field(default_factory=LikeTraffic)
     record: Callable[[LaneMap], Callable[[Tick], Any]] | None = None
     measure: Measure | None = None
 

@@ -31,7 +31,7 @@ from limsim_jax.metrics.observer import EvaluateEgo
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import NEAR_MISS, Rss
 from limsim_jax.policies import POLICIES
-from limsim_jax.policies.base import Policy, build_policy, variants
+from limsim_jax.policies.base import PolicyLike, build_policy, variants
 from limsim_jax.policies.predict import Replayed, constant_velocity
 from limsim_jax.simulation.rollout import Carry, Result, Rollout, Started, started
 from limsim_jax.simulation.totals import Totals
@@ -309,7 +309,7 @@ class Episodes:
 class _Braking:
     """A policy, and a vehicle that brakes from some moment on."""
 
-    def __init__(self, policy: Policy, slot: jax.Array, at: jax.Array) -> None:
+    def __init__(self, policy: PolicyLike, slot: jax.Array, at: jax.Array) -> None:
         self.free, self.others = policy.free, getattr(policy, "others", 0)
         self.init = policy.init
         self.policy, self.slot, self.at = policy, slot, at
@@ -337,13 +337,13 @@ def _source_hash() -> str:
 # --- from the words of the file to arrays ------------------------------------------------------------
 
 
-def _policy(experiment: ExperimentFile) -> Policy:
+def _policy(experiment: ExperimentFile) -> PolicyLike:
     name, options = experiment.ego.policy, experiment.ego.options
     where = f"{experiment.name}: ego.policy"
     if ":" in name:
         module, _, attribute = name.partition(":")
         try:
-            factory: Callable[..., Policy] = getattr(importlib.import_module(module), attribute)
+            factory: Callable[..., PolicyLike] = getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError) as error:
             raise ExperimentError(f"{where}: '{name}' cannot be loaded: {error}") from None
     elif name in POLICIES:

@@ -11,6 +11,7 @@ from traffic_worlds import bundled, scattered
 
 from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import default_goals
+from limsim_jax.policies import POLICIES
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.policies.simple import FollowLane
@@ -165,6 +166,6 @@ def test_options_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="radius"):
         AreaOfInterest(FollowLane(), radius=0.0)
     with pytest.raises(ValueError, match=r"unknown policy 'pilot'; known are .*limsim_tm"):
-        AreaOfInterest("pilot")
+        POLICIES["area_of_interest"]("pilot")
     with pytest.raises(ValueError, match="moves in the plane"):
         AreaOfInterest(LikeTraffic())

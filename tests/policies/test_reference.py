@@ -13,7 +13,7 @@ from limsim_jax.policies.reference import (
     beside,
     center_lane,
     motion_on,
-    reference_path,
+    path_from,
     to_cartesian,
 )
 from limsim_jax.traffic.ego import from_lane
@@ -44,7 +44,7 @@ def ways(name, seed, **more):
     state, lane_map = scattered(name, N, seed), bundled(name)[1]
     slot = jnp.arange(N)
     lane, s = center_lane(lane_map, state, slot)
-    path = jax.jit(lambda: reference_path(lane_map, lane, s, state.goal, points=POINTS, step=STEP, **more))()
+    path = jax.jit(lambda: path_from(lane_map, lane, s, state.goal, points=POINTS, step=STEP, **more))()
     return lane_map, state, lane, s, path
 
 
@@ -85,8 +85,8 @@ def test_the_lane_that_the_front_is_on_counts():
     )  # fmt: skip
     other = next(int(k) for k in successors[lane] if k >= 0 and k != int(routes.next_lane[lane, goal]))
     place = jnp.array([lane]), lane_map.length[lane][None] - 3.0, jnp.array([goal])
-    by_route = reference_path(lane_map, *place, points=POINTS, step=STEP)
-    known = reference_path(lane_map, *place, points=POINTS, step=STEP, after=jnp.array([other]))
+    by_route = path_from(lane_map, *place, points=POINTS, step=STEP)
+    known = path_from(lane_map, *place, points=POINTS, step=STEP, after=jnp.array([other]))
     assert int(by_route.lane[0, 2]) == int(routes.next_lane[lane, goal])
     places, _ = walk(lane_map, lane, float(place[1][0]), goal, other)
     np.testing.assert_array_equal(known.lane[0], [row for row, _ in places])
@@ -148,7 +148,7 @@ def test_motion_across_is_that_of_the_lane_change():
     second, dx, _ = advance(tick, lane_map, first, zero)
     slot = jnp.arange(N)
     lane, s = center_lane(lane_map, first, slot)
-    path = reference_path(lane_map, lane, s, first.goal, points=POINTS, step=STEP)
+    path = path_from(lane_map, lane, s, first.goal, points=POINTS, step=STEP)
     found = motion_on(path, first, slot, first.d)
     np.testing.assert_allclose(found.d_v, (second.d - first.d) / tick.dt, atol=0.06)
     np.testing.assert_allclose(found.slope, (second.d - first.d) / dx, atol=5e-3)
@@ -163,7 +163,7 @@ def test_motion_of_free_egos_is_that_of_their_heading():
     state = dataclasses.replace(state, egos=egos)
     slot = jnp.array([7, 3, 0])
     lane, s = center_lane(lane_map, state, slot)
-    path = reference_path(lane_map, lane, s, state.goal[slot], points=POINTS, step=STEP)
+    path = path_from(lane_map, lane, s, state.goal[slot], points=POINTS, step=STEP)
     found = motion_on(path, state, slot, jnp.zeros(3))
     v = np.asarray(state.v)[[7, 3, 0]]
     np.testing.assert_allclose(found.slope, [np.tan(-0.05), np.tan(0.1), 0], atol=2e-3)
@@ -174,5 +174,5 @@ def test_motion_of_free_egos_is_that_of_their_heading():
 def test_no_lane_gives_a_harmless_way():
     lane_map = bundled("highway")[1]
     nobody = jnp.array([NO_LANE])
-    path = reference_path(lane_map, nobody, jnp.zeros(1), jnp.zeros(1, jnp.int32), points=POINTS, step=STEP)
+    path = path_from(lane_map, nobody, jnp.zeros(1), jnp.zeros(1, jnp.int32), points=POINTS, step=STEP)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(path)) and isinstance(path, ReferencePath)

@@ -12,13 +12,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, neighbor
-from limsim_jax.policies.base import Policy
+from limsim_jax.policies.base import Policy, PolicyLike
 from limsim_jax.policies.limsim_tm.decide import Maneuvers, decide_maneuvers, grouped, neighbours
 from limsim_jax.policies.limsim_tm.plan import Lattice, Merge, Others, Task, plan, room_needed
 from limsim_jax.policies.limsim_tm.search import Settings, no_plan, shifted
 from limsim_jax.policies.perception import Around, around, rules
 from limsim_jax.policies.predict import Prediction, Predictor, along_route, shared
-from limsim_jax.policies.reference import ReferencePath, beside, center_lane, motion_on, reference_path
+from limsim_jax.policies.reference import ReferencePath, beside, center_lane, motion_on, path_from
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.ego import Trajectory, at_slots
@@ -40,13 +40,14 @@ class Memory(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LimSimTM:
+class LimSimTM(Policy):
     """Searches for a manoeuvre, then plans a trajectory; the rules of the road are those of the traffic.
 
     Attributes:
       others: vehicles of the traffic that it drives beside the egos, see `AreaOfInterest`.
       nearest: others that are looked at.
-      search: for manoeuvres; None: lane changes by MOBIL.
+      search: of maneuvers; None: lane changes by MOBIL.
+      simulations: of each search, at least 1; None: as in `search`.
       search_every: decisions from one search to the next.
       obedience: desired speed of the egos, as a share of the speed limit at most.
       predict: where the others will be.
@@ -58,6 +59,7 @@ class LimSimTM:
     others: int = 0
     nearest: int = 8
     search: Settings | None = field(default_factory=lambda: Settings(simulations=40, change=0.08))
+    simulations: int | None = None
     search_every: int = 3
     obedience: float = 0.985
     predict: Predictor = along_route
@@ -65,9 +67,20 @@ class LimSimTM:
     lattice: Lattice = field(default_factory=Lattice)
     traffic: Traffic = field(default_factory=Traffic)
 
-    free = True
+    default_name = "limsim_tm"
 
-    def variants(self, seen: Predictor) -> dict[str, Policy]:
+    def __post_init__(self) -> None:
+        if self.simulations is not None and self.simulations < 1:
+            raise ValueError(f"simulations: {self.simulations}; at least 1")
+
+    @property
+    def settings(self) -> Settings | None:
+        """Those of the search, with `simulations`."""
+        if self.search is None or self.simulations is None:
+            return self.search
+        return replace(self.search, simulations=self.simulations)
+
+    def variants(self, seen: Predictor) -> dict[str, PolicyLike]:
         """With a reference in the place of a module: what came to pass, MOBIL, car following on its lane."""
         return {
             "prediction": replace(self, predict=seen),
@@ -79,7 +92,7 @@ class LimSimTM:
         """No lane change under way, nothing searched."""
         del lane_map
         rows = state.egos.slot.shape[0]
-        size = Settings() if self.search is None else self.search
+        size = self.settings or Settings()
         maneuvers = Maneuvers(
             side=jnp.zeros(rows, jnp.int32),
             v=jnp.full((rows, size.steps + 1), _ANY_SPEED),
@@ -118,7 +131,7 @@ class LimSimTM:
             return self.predict(lane_map, state, times, stop=wall, plans=known)
 
         prediction = predict(self.lattice.times())
-        own = reference_path(lane_map, lane, s, goal, points=_POINTS, step=_STEP)
+        own = path_from(lane_map, lane, s, goal, points=_POINTS, step=_STEP)
         nearby = around(state, prediction, own, slot, self.nearest)
 
         maneuvers, since = memory.maneuvers, jnp.where(same, memory.since, -1e3)
@@ -141,7 +154,7 @@ class LimSimTM:
         wish = jnp.where((wish * need < 0) & (press > 0.3), 0, wish)
         look = jnp.where(side != 0, side, jnp.where(wish != 0, wish, jnp.sign(need)))
         other_lane, other_s, other_d, there = beside(lane_map, lane, s, d, look)
-        target = reference_path(lane_map, other_lane, other_s, goal, points=_POINTS, step=_STEP)
+        target = path_from(lane_map, other_lane, other_s, goal, points=_POINTS, step=_STEP)
         traffic = around(state, prediction, target, slot, self.nearest)
         begins = (side == 0) & (jnp.abs(d) < 0.6) & self._may_change(lane_map, state, slot, lane, look)
         # changes to the left and to the right begin in turns, as in all traffic
@@ -187,7 +200,7 @@ class LimSimTM:
 
         A loop of at most one pass: where no world of a batch is due, it costs nothing.
         """
-        settings, slot = self.search, state.egos.slot
+        settings, slot = self.settings, state.egos.slot
         if settings is None:
             return maneuvers
 

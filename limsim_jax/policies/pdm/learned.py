@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 from limsim_jax.files import write_whole
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.policies.base import Policy
 from limsim_jax.policies.pdm.policy import PDMClosed, Plan
 from limsim_jax.policies.pdm.road import DT, STEPS, bodies, road_ahead
 from limsim_jax.policies.reference import to_cartesian
@@ -187,7 +188,7 @@ def in_frame(origin: tuple[Any, Any, Any], x: Any, y: Any, heading: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class PDMHybrid:
+class PDMHybrid(Policy):
     """PDM-Closed with learned poses beyond `CORRECTED_FROM`; its egos move in the plane.
 
     Its trajectory reaches 8 s. What is driven until the next decision is PDM-Closed's.
@@ -201,9 +202,6 @@ class PDMHybrid:
     weights: str | None = None
     seen: int = 32
     strict_tuplan: bool = False
-
-    free = True
-    others = 0
 
     def __post_init__(self) -> None:
         PDMClosed(seen=self.seen)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Int
 
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.numerics import safe_norm
-from limsim_jax.policies.base import Policy
+from limsim_jax.policies.base import Policy, PolicyLike
 from limsim_jax.policies.pdm.proposals import FRACTIONS, idm, leaders, poses
 from limsim_jax.policies.pdm.road import DT, STEPS, Body, bodies, others_around, road_ahead
 from limsim_jax.policies.pdm.score import TTC, Scores, score
@@ -43,7 +43,7 @@ class Plan(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PDMClosed:
+class PDMClosed(Policy):
     """PDM-Closed as a policy; its egos move in the plane.
 
     Attributes:
@@ -56,20 +56,13 @@ class PDMClosed:
     strict_tuplan: bool = False
     predict: Predictor = constant_velocity
 
-    free = True
-    others = 0
-
     def __post_init__(self) -> None:
         if self.seen < 1:
             raise ValueError(f"seen: {self.seen} others; at least 1")
 
-    def variants(self, seen: Predictor) -> dict[str, Policy]:
+    def variants(self, seen: Predictor) -> dict[str, PolicyLike]:
         """With a reference in the place of a module: what came to pass, car following on its lane."""
         return {"prediction": replace(self, predict=seen), "planning": FollowLane()}
-
-    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
-        """Nothing to remember."""
-        del config, lane_map, state
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array

@@ -12,7 +12,7 @@ from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.policies.predict import Predictor, nearest
-from limsim_jax.policies.reference import ReferencePath, reference_path
+from limsim_jax.policies.reference import ReferencePath, path_from
 from limsim_jax.types import State
 from limsim_jax.xla import computed_once
 
@@ -135,7 +135,7 @@ def road_ahead(lane_map: LaneMap, state: State, slot: Int[Array, " V"], body: Bo
     after = jnp.where(behind, lane, NO_LANE)
     s = jnp.where(behind, s + lane_map.length[came], s)
     centerline = computed_once(
-        reference_path(lane_map, first, s, goal, points=_POINTS, step=SPACING, lanes=_LANES, after=after)
+        path_from(lane_map, first, s, goal, points=_POINTS, step=SPACING, lanes=_LANES, after=after)
     )
     dx, dy = body.x - centerline.x[:, 0], body.y - centerline.y[:, 0]
     cos, sin = jnp.cos(centerline.heading[:, 0]), jnp.sin(centerline.heading[:, 0])

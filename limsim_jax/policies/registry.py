@@ -1,0 +1,57 @@
+"""Policies by the names that experiment files and the command line use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from limsim_jax.policies.area import AreaOfInterest
+from limsim_jax.policies.base import LikeTraffic, PolicyLike, build_policy
+from limsim_jax.policies.limsim_tm import LimSimTM
+from limsim_jax.policies.pdm import PDMClosed, PDMHybrid
+from limsim_jax.policies.simple import ConstantSpeed, FollowLane
+
+
+def area_of_interest(
+    around: str | PolicyLike = "limsim_tm",
+    ego: str | PolicyLike | None = None,
+    slots: int = 8,
+    radius: float = 50.0,
+    leave: float | None = None,
+    dwell: float = 3.0,
+    options: Mapping[str, Any] | None = None,
+) -> AreaOfInterest:
+    """`AreaOfInterest` with planners by name; `options` are those of `around`.
+
+    Raises:
+      ValueError: an unknown name or option, or a value that makes no sense.
+    """
+    return AreaOfInterest(
+        around=_by_name(around, options or {}),
+        ego=None if ego is None else _by_name(ego, {}),
+        slots=slots,
+        radius=radius,
+        leave=leave,
+        dwell=dwell,
+    )
+
+
+def _by_name(policy: str | PolicyLike, options: Mapping[str, Any]) -> PolicyLike:
+    if not isinstance(policy, str):
+        return policy
+    if policy not in POLICIES or policy == "area_of_interest":
+        known = ", ".join(name for name in POLICIES if name != "area_of_interest")
+        raise ValueError(f"unknown policy '{policy}'; known are {known}")
+    return build_policy(POLICIES[policy], options)
+
+
+POLICIES: dict[str, Callable[..., PolicyLike]] = {
+    "like_traffic": LikeTraffic,
+    "constant_speed": ConstantSpeed,
+    "follow_lane": FollowLane,
+    "pdm_closed": PDMClosed,
+    "pdm_hybrid": PDMHybrid,
+    "limsim_tm": LimSimTM,
+    "area_of_interest": area_of_interest,
+}
+"""Factories by name; other policies are named by module and factory, `package.module:factory`."""
