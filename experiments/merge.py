@@ -29,7 +29,7 @@ from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Traffic
-from limsim_jax.traffic.vehicles import default_population, fitting
+from limsim_jax.traffic.vehicles import default_population, restrict_to_map
 from limsim_jax.types import Config
 from limsim_jax.xla import use_all_cores
 
@@ -90,7 +90,7 @@ def ours(net: Path, demand: list[tuple[str, str, float]], worlds: int) -> dict[s
     found = read_network(net)
     lane_map = build_lane_map(found)
     wanted = [Flow(origin=a, goal=b, rate=rate) for a, b, rate in demand if rate > 0]
-    population = fitting(default_population(), lane_map)
+    population = restrict_to_map(default_population(), lane_map)
     goals = default_goals(found)
     spec = build_demand(found, lane_map, goals, wanted, population, horizon=HORIZON, vehicles=0)
     run = Rollout(Config(dt=DT), Traffic(), HORIZON, measure=Changes())

@@ -51,7 +51,7 @@ class Seen(NamedTuple):
     s: Float[Array, " N"]
     v: Float[Array, " N"]
     a: Float[Array, " N"]
-    held: Bool[Array, " N"]
+    yielding: Bool[Array, " N"]
 
 
 def odd(lane_map: LaneMap, seen: Seen) -> dict[str, Bool[np.ndarray, "T N"]]:
@@ -72,7 +72,7 @@ def odd(lane_map: LaneMap, seen: Seen) -> dict[str, Bool[np.ndarray, "T N"]]:
             ahead, across = c * x + s * y, c * y - s * x
             near = (ahead > 0.5) & (ahead < (box[t, n, 3] + box[t, :, 3]) / 2 + 10) & (np.abs(across) < 2)
             at_line = -2 < to_line[t, n] < 3
-            standing[t, n] = not (near & seen.active[t]).any() and not at_line and not seen.held[t, n]
+            standing[t, n] = not (near & seen.active[t]).any() and not at_line and not seen.yielding[t, n]
     happens = {
         "jumps": same & (np.abs(moved - DT * (v[1:] + v[:-1]) / 2) > 0.25),
         "slides": same & (moved > 0.15) & (off > 0.25),
@@ -97,7 +97,7 @@ def watch(name: str, worlds: int) -> dict[str, Any]:
     def record(lane_map: LaneMap) -> Any:
         def look(tick: Tick) -> Seen:
             x = tick.state
-            return Seen(boxes(lane_map, x), x.active, x.vehicle, x.lane, x.s, x.v, x.a, x.held)
+            return Seen(boxes(lane_map, x), x.active, x.vehicle, x.lane, x.s, x.v, x.a, x.yielding)
 
         return look
 

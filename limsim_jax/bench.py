@@ -211,11 +211,11 @@ def build_traffic(
     from limsim_jax.maps.origins import origins, road_origins
     from limsim_jax.maps.routing import default_goals
     from limsim_jax.traffic.demand import Flow, build_demand
-    from limsim_jax.traffic.vehicles import default_population, fitting
+    from limsim_jax.traffic.vehicles import default_population, restrict_to_map
 
     names = list(origins(network)) or road_origins(network, 12)
     flows = [Flow(origin=name, rate=rate) for name in names]
-    goals, population = default_goals(network), fitting(default_population(), lane_map)
+    goals, population = default_goals(network), restrict_to_map(default_population(), lane_map)
     demand = build_demand(network, lane_map, goals, flows, population, horizon=seconds, vehicles=vehicles)
     return demand, len(names)
 

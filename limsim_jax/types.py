@@ -153,7 +153,7 @@ class State:
     rest: Float[Array, " N"]  # s until the next lane change may start
     # junctions
     waiting: Float[Array, " N"]  # s below walking speed
-    held: Bool[Array, " N"]  # stood for the right of way, a sign or a full exit at the last decision
+    yielding: Bool[Array, " N"]  # stood for the right of way, a sign or a full exit at the last decision
     stopped: Bool[Array, " N"]  # has stopped at the stop sign ahead
     # record
     distance: Float[Array, " N"]  # m since it entered

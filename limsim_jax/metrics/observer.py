@@ -99,7 +99,7 @@ class EvaluateEgo:
             lead=jnp.where(ahead, other, -1), lead_gap=jnp.where(ahead, jnp.maximum(gap, 0), NO_GAP)
         )
         return record._replace(
-            ego=ego, traffic=record.traffic._replace(v_free=tick.decision.v0), way=tick.decision.way
+            ego=ego, traffic=record.traffic._replace(v_free=tick.decision.v0), way=tick.decision.lanes
         )
 
     def update(

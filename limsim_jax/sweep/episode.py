@@ -46,7 +46,7 @@ from limsim_jax.traffic.population_file import read_population
 from limsim_jax.traffic.vehicles import (
     URBAN,
     default_population,
-    fitting,
+    restrict_to_map,
     sample_vehicles,
     uniform_population,
 )
@@ -473,7 +473,7 @@ def _demand(
         shares = URBAN if traffic.mix is None else traffic.mix
         drivers = traffic.drivers
         population = default_population(shares) if drivers is None else read_population(drivers, shares)
-        population = fitting(population, lane_map)
+        population = restrict_to_map(population, lane_map)
         return build_demand(
             network, lane_map, goals, flows, population, horizon=experiment.horizon, density=traffic.density,
             vehicles=traffic.vehicles, egos=egos,

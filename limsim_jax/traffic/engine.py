@@ -157,7 +157,7 @@ def decide(
     approaches = approaches_ahead(config, lane_map, state, ahead)
     lights = switch(config, lane_map, state, approaches.lane, approaches.line)
     way = give_way(lane_map, state, approaches, own, lights)
-    state = replace(state, lights=lights, held=way.yielding, stopped=way.stopped)
+    state = replace(state, lights=lights, yielding=way.yielding, stopped=way.stopped)
     end = _lane_end(lane_map, state, ahead)
     # as far back as it can still stop for gently
     end = jnp.maximum(end - choice.stops_before, jnp.minimum(end, state.v * state.v / (2 * _GENTLY)))
@@ -172,7 +172,7 @@ def decide(
         v_ahead=v_ahead,
         ahead=distance,
         courtesy=choice.courtesy,
-        way=ahead.lane,
+        lanes=ahead.lane,
     )
 
 

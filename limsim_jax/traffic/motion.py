@@ -45,7 +45,7 @@ class Decision(NamedTuple):
     v_ahead: Float[Array, " N"]  # m/s, lower speed needed further on
     ahead: Float[Array, " N"]  # m to there, at the decision
     courtesy: Obstacles  # who is let in, and behind whom a place is looked for
-    way: Int[Array, "N D"]  # lane and the lanes that it will drive on next
+    lanes: Int[Array, "N D"]  # the lanes that it drives on next, its own first
 
 
 COURTESY = 2.0

@@ -62,7 +62,7 @@ class Order(NamedTuple):
     last: Int[Array, " L"]  # and of the last, -1 if there is none
 
 
-class Shelf:
+class SortKeys:
     """Puts entries in order of row and position, and finds places among them.
 
     Sorting one word that holds row, position and number of the entry is several times as fast as sorting
@@ -152,7 +152,7 @@ def sort_vehicles(lane_map: LaneMap, state: State) -> Order:
     s = jnp.concatenate([state.s, other_s])
     size, count = lane_map.length.shape[0], lane.shape[0]
     place = jnp.arange(count, dtype=jnp.int32)
-    key, entry = Shelf(size, count).sort(lane, s / lane_map.length[lane])
+    key, entry = SortKeys(size, count).sort(lane, s / lane_map.length[lane])
     lane, s = lane[entry], s[entry]
     # unique indices, the others out of bounds and dropped: no two writes meet
     changes = lane[1:] != lane[:-1]
@@ -187,8 +187,8 @@ def place_of(
     order: Order, lane_map: LaneMap, lane: Int[Array, "*b"], s: Float[Array, "*b"]
 ) -> Int[Array, "*b"]:
     """Place in the order of the first entry beyond `s` (m) on `lane`: a binary search."""
-    shelf = Shelf(lane_map.length.shape[0], order.key.shape[0])
-    return shelf.first_beyond(order.key, shelf.key(lane, s / lane_map.length[lane]))
+    sorting = SortKeys(lane_map.length.shape[0], order.key.shape[0])
+    return sorting.first_beyond(order.key, sorting.key(lane, s / lane_map.length[lane]))
 
 
 def _entry(

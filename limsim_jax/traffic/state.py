@@ -57,7 +57,7 @@ def start_state(
         shift=zero,
         rest=zero,
         waiting=zero,
-        held=off,
+        yielding=off,
         stopped=off,
         distance=zero,
         entered=zero,

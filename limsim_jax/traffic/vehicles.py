@@ -367,17 +367,17 @@ def uniform_population(vehicle_class: str = "car", **parameters: float) -> Popul
 
 
 SWEEP = 0.6
-"""m, by how much a body may stand out of its path in the tightest bend of a map, see `fitting`."""
+"""m, by how much a body may stand out of its path in the tightest bend of a map, see `restrict_to_map`."""
 
 
 RARE_BENDS = 50
-"""One lane in so many does not count in `fitting`."""
+"""One lane in so many does not count in `restrict_to_map`."""
 
 CAR = 5.0
 """m, length up to which a vehicle fits everywhere."""
 
 
-def fitting(population: Population, lane_map: LaneMap) -> Population:
+def restrict_to_map(population: Population, lane_map: LaneMap) -> Population:
     """The population without types that are too long for the bends of a map.
 
     In a bend of curvature kappa the ends of a body of length l stand out by kappa l^2 / 8. On most urban

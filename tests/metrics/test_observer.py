@@ -191,7 +191,7 @@ def random_tick(rng, slot: int, lane: int | None = None) -> Tick:
         obstacles=Obstacles(i32(other), f32(gap)),
         v0=f32(rng.uniform(3, 20, N)), v_ahead=f32(rng.uniform(3, 20, N)), ahead=f32(rng.uniform(0, 99, N)),
         courtesy=Obstacles(i32(np.full((N, 2), -1)), f32(np.full((N, 2), NO_GAP))),
-        way=i32(way),
+        lanes=i32(way),
     )  # fmt: skip
     return Tick(
         state=state,
@@ -274,7 +274,7 @@ def test_plain_columns_are_those_of_the_state():
         np.testing.assert_array_equal(traffic.v_free, tick.decision.v0)
         np.testing.assert_array_equal(traffic.left, tick.left)
         assert traffic.inside.all() and not traffic.changed.any()
-        np.testing.assert_array_equal(record.way, tick.decision.way)
+        np.testing.assert_array_equal(record.way, tick.decision.lanes)
         np.testing.assert_array_equal(record.other, given()[i][3])
         assert record.stopped == state.stopped[slot] and ego.off_road == np.asarray(tick.off_road)[slot]
 
@@ -508,7 +508,7 @@ def test_whose_way_may_meet_that_of_the_ego():
     for _ in range(60):
         slot = int(rng.integers(N))
         tick = random_tick(rng, slot)
-        way = np.array(tick.decision.way)
+        way = np.array(tick.decision.lanes)
         other = np.where(rng.random(N) < 0.3, rng.choice(way.ravel(), N), NO_LANE)
         found = np.asarray(
             meets(crossing(), jnp.int32(slot), jnp.asarray(way), jnp.asarray(other, jnp.int32))

@@ -21,7 +21,12 @@ from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, sample_scena
 from limsim_jax.traffic.ego import assign, from_lane, with_rows
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes
-from limsim_jax.traffic.vehicles import default_population, fitting, sample_vehicles, uniform_population
+from limsim_jax.traffic.vehicles import (
+    default_population,
+    restrict_to_map,
+    sample_vehicles,
+    uniform_population,
+)
 from limsim_jax.types import Config
 
 CONFIG = Config(dt=0.1)
@@ -118,7 +123,7 @@ def runs():
     """The same three worlds without and with an area in which traffic drives in the plane."""
     network, lane_map = bundled("roundabout")
     flows = [Flow(origin=name, rate=350.0) for name in origins(network)]
-    population = fitting(default_population(), lane_map)
+    population = restrict_to_map(default_population(), lane_map)
     typical = uniform_population("car")
     vehicle = jnp.argmax(typical.share)[None].astype(jnp.int32)
     driver, shape = sample_vehicles(typical, jax.random.key(0), jnp.zeros(1, jnp.int32), vehicle)

@@ -26,7 +26,7 @@ from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, sample_scena
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes
-from limsim_jax.traffic.vehicles import default_population, fitting
+from limsim_jax.traffic.vehicles import default_population, restrict_to_map
 from limsim_jax.types import Config
 
 
@@ -84,7 +84,7 @@ def runs():
     """Two worlds of the roundabout with an ego that LimSim-TM drives."""
     network, lane_map = bundled("roundabout")
     flows = [Flow(origin=name, rate=350.0) for name in origins(network)]
-    population = fitting(default_population(), lane_map)
+    population = restrict_to_map(default_population(), lane_map)
     egos = EgoStart(driver=drivers(1), shape=shapes(1), free=jnp.asarray([True]))
     demand = build_demand(
         network, lane_map, default_goals(network), flows, population, horizon=30.0, density=4.0, egos=egos

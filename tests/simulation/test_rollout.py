@@ -23,7 +23,12 @@ from limsim_jax.simulation.trace import trace
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Traffic
-from limsim_jax.traffic.vehicles import default_population, fitting, sample_vehicles, uniform_population
+from limsim_jax.traffic.vehicles import (
+    default_population,
+    restrict_to_map,
+    sample_vehicles,
+    uniform_population,
+)
 from limsim_jax.types import Config
 
 SLOTS = 24
@@ -35,7 +40,7 @@ def sampler():
     """Scenarios on the bundled roundabout."""
     network, lane_map = bundled("roundabout")
     flows = [Flow(origin=name, rate=350.0) for name in origins(network)]
-    population = fitting(default_population(), lane_map)
+    population = restrict_to_map(default_population(), lane_map)
     demand = build_demand(
         network, lane_map, default_goals(network), flows, population, horizon=RUN.horizon, density=4.0
     )
@@ -139,7 +144,7 @@ def area():
     kind = jnp.argmax(typical.share)[None].astype(jnp.int32)
     driver, shape = sample_vehicles(typical, jax.random.key(0), jnp.zeros(1, jnp.int32), kind)
     egos = EgoStart(driver=driver, shape=shape, free=jnp.asarray([False]))
-    population = fitting(default_population({"car": 0.4, "van": 0.3, "motorcycle": 0.3}), lane_map)
+    population = restrict_to_map(default_population({"car": 0.4, "van": 0.3, "motorcycle": 0.3}), lane_map)
     demand = build_demand(
         network, lane_map, default_goals(network), [], population, horizon=5.0, density=6.0, egos=egos
     )

@@ -16,7 +16,7 @@ from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.motion import tails
-from limsim_jax.traffic.neighbors import Shelf
+from limsim_jax.traffic.neighbors import SortKeys
 from limsim_jax.traffic.parameters import JUNCTIONS
 from limsim_jax.traffic.right_of_way.approaches import APPROACHES, Approaches
 from limsim_jax.traffic.right_of_way.passage import (
@@ -176,7 +176,7 @@ def _sorted(lane_map: LaneMap, state: State, approaches: Approaches, observed: O
     entries = Observed(*(x.ravel() for x in entries))
     connector = jnp.concatenate([approaches.connector, tail], -1).ravel()
     entries = computed_once(entries)
-    keys, entry = Shelf(table.length.shape[0], connector.shape[0]).sort(
+    keys, entry = SortKeys(table.length.shape[0], connector.shape[0]).sort(
         connector, _share(lane_map, connector, entries.front - entries.length)
     )
     return _OnConnectors(connector, entries, keys, entry)
@@ -223,7 +223,7 @@ def _foes(lane_map: LaneMap, connectors: _OnConnectors, pairs: _Pairs, observed:
     table, k, c = lane_map.conflicts, pairs.connector, pairs.conflict
     connector, entries, keys, entry = connectors
     count = connector.shape[0]
-    search = Shelf(table.length.shape[0], count)
+    search = SortKeys(table.length.shape[0], count)
     foe, kind = table.foe[k, c], table.type[k, c]
     s_in, s_out, f_in, f_out = (x[k, c][None] for x in (table.s_in, table.s_out, table.f_in, table.f_out))
     splits, merges = (kind == ConflictType.DIVERGE)[None], (kind == ConflictType.MERGE)[None]

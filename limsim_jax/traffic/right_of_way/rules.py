@@ -62,7 +62,7 @@ def give_way(
     queued = standing & (own.lead_gap < JUNCTIONS.queue_gap * driver.s0 + JUNCTIONS.queue_room)
     starts = state.a > JUNCTIONS.starting
     # stands for long and does not yield: whatever else it waits for
-    queued |= (state.v < stands) & (state.waiting > JUNCTIONS.tie_time) & ~state.held & ~starts
+    queued |= (state.v < stands) & (state.waiting > JUNCTIONS.tie_time) & ~state.yielding & ~starts
     sign, stopped = stop_signs(lane_map, state, approaches)
 
     def everywhere(x: Array) -> Array:
@@ -80,7 +80,7 @@ def give_way(
         waiting=everywhere(state.waiting),
         line=approaches.line,
         blocked=everywhere((at_light < NO_GAP) | full | queued[:, None]),
-        yielding=everywhere(state.held),
+        yielding=everywhere(state.yielding),
         slowing=everywhere(state.a < -JUNCTIONS.slowing),
         light=light.astype(jnp.float32),
         slot=everywhere(jnp.arange(n)),
