@@ -19,6 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from differential_evolution import fit_by_evolution
 from scipy.optimize import differential_evolution
 
 from limsim_jax.calibration.cleaning import Segment
@@ -59,9 +60,13 @@ def files(folder: Path, name: str) -> list[Path]:
 
 
 def timed(segments: list[Segment], model: str, method: str) -> tuple[Any, float]:
-    """A fit and its seconds without compilation: the second of two, the first of one iteration if long."""
-    fit(segments, model, method=method, iterations=1 if method == "de" else None)
-    found = fit(segments, model, method=method)
+    """A fit and its seconds without compilation: the second of two, the first of one generation if long."""
+    if method == "de":
+        fit_by_evolution(segments, MODELS[model], generations=1)
+        found = fit_by_evolution(segments, MODELS[model])
+    else:
+        fit(segments, MODELS[model], method=method)
+        found = fit(segments, MODELS[model], method=method)
     return found, found.seconds
 
 
@@ -105,7 +110,7 @@ def data_set(folder: Path, name: str, models: Sequence[str], before: dict[str, A
     segments, quality = gather(paths, shortest=shortest)
     rows = dict(before.get("models", {}))
     for model in models:
-        result = calibrate(paths, model=model, shortest=shortest)
+        result = calibrate(paths, model=MODELS[model], shortest=shortest)
         lm, lm_seconds = timed(segments, model, "lm")
         de, de_seconds = timed(segments, model, "de")
         few, each = scipy_de(segments, model, SAMPLED)
@@ -139,7 +144,7 @@ def data_set(folder: Path, name: str, models: Sequence[str], before: dict[str, A
 def errors_of(found: Any, segments: list[Segment]) -> dict[str, np.ndarray]:
     """Objectives of a fit."""
     _, data, dt = stack(segments)
-    result = errors(MODELS[found.model], jnp.asarray(found.parameters, jnp.float32), data, dt)
+    result = errors(found.model, jnp.asarray(found.parameters, jnp.float32), data, dt)
     return {name: np.asarray(values, float) for name, values in result.items()}
 
 
@@ -148,7 +153,7 @@ def synthetic(count: int = 200) -> dict[str, Any]:
     rng = np.random.default_rng(0)
     truth = drivers(count, 0.12, rng)
     segments = follow(truth, rng)
-    found = fit(segments, "idm", objective="gap")
+    found = fit(segments, objective="gap")
     known = uncertainty(found, segments)
     off = np.abs(found.parameters / truth - 1)
     inside = (known.interval[:, 0] <= truth) & (truth <= known.interval[:, 1])
@@ -169,7 +174,7 @@ def methods(folder: Path) -> dict[str, Any]:
     """All methods on one data set, IDM."""
     segments = gather(files(folder, "ngsim"))[0][:COMPARED]
     rows, best = {}, None
-    for method in METHODS:
+    for method in (*METHODS, "de"):
         found, seconds = timed(segments, "idm", method)
         best = found.error if best is None else np.minimum(best, found.error)
         rows[method] = {"seconds": seconds, "errors": found.error.tolist()}

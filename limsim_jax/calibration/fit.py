@@ -10,7 +10,6 @@ Methods, behind one function `fit`:
 - `lm`: Levenberg-Marquardt, projected on the box: a parameter at its bound stays out of the step until the
   gradient points inside. From the best of quasi-random points. The default.
 - `lbfgs`, `adam`: optax, from the same starts, without bounds on theta in p = lo + (hi - lo) sigmoid(theta).
-- `de`: differential evolution (Storn, Price 1997; best/1/bin with dithering), no gradients; the reference.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
@@ -42,8 +41,10 @@ UPPER = (45.0, 4.0, 8.0, 4.0, 5.0)
 """The box of the parameters."""
 
 MODELS: dict[str, CarFollowing] = {"idm": IDM(), "iidm": IIDM(), "acc": ACC()}
+"""By the names that files and the command line have for them."""
+
 OBJECTIVES = ("gap", "speed", "mixed", "log", "relative", "absolute")
-METHODS = ("lm", "lbfgs", "adam", "de")
+METHODS = ("lm", "lbfgs", "adam")
 
 STANDING = 0.1
 """m/s, who is slower stands; of a stop only the first `STANDING_TIME` s count."""
@@ -66,6 +67,11 @@ class Data(NamedTuple):
     a_lead: Float[Array, "*D T"]  # m/s^2, of the step before
     start: Float[Array, "*D T"]  # 1 where a segment begins and the follower is put where it was
     weight: Float[Array, "*D T"]  # 1 where samples count
+
+
+def model_name(model: CarFollowing) -> str:
+    """The name of a model in files; of one that is not in `MODELS`, that of its class."""
+    return next((name for name, known in MODELS.items() if known == model), type(model).__name__)
 
 
 def stack(segments: Sequence[Segment], samples: int = 0) -> tuple[tuple[str, ...], Data, float]:
@@ -241,7 +247,8 @@ def _residuals(problem: Problem, u: Array, data: Data, prior: Prior | None) -> A
     return jnp.concatenate([r, off])
 
 
-def _cost(problem: Problem, u: Array, data: Data, prior: Prior | None = None) -> Array:
+def cost(problem: Problem, u: Array, data: Data, prior: Prior | None = None) -> Array:
+    """Mean square of the objective of one driver at a point `[P]` of the unit box, plus what a prior adds."""
     r = _residuals(problem, u, data, prior)
     return _finite(jnp.sum(r * r))
 
@@ -286,7 +293,7 @@ def _levenberg_marquardt(
         return _normal_equations(problem, u, data, prior)
 
     def cost(u: Array, data: Data, prior: Prior | None) -> Array:
-        return _cost(problem, u, data, prior)
+        return cost(problem, u, data, prior)
 
     def over_starts(f: Any) -> Any:
         return jax.vmap(jax.vmap(f, in_axes=(0, None, None)))
@@ -336,13 +343,13 @@ def _levenberg_marquardt(
 @partial(jax.jit, static_argnames=("problem",))
 def _screen(problem: Problem, u: Array, data: Data) -> Array:
     """Costs `[D, S]` of the same points `[S, P]` for all drivers."""
-    return jax.vmap(lambda data: jax.vmap(lambda one: _cost(problem, one, data))(u))(data)
+    return jax.vmap(lambda data: jax.vmap(lambda one: cost(problem, one, data))(u))(data)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _loss(problem: Problem, theta: Array, data: Data) -> Array:
     """Logarithm of the error at p = lo + (hi - lo) sigmoid(theta); its gradient is by forward mode."""
-    return 0.5 * jnp.log(_cost(problem, jax.nn.sigmoid(theta), data) + 1e-8)
+    return 0.5 * jnp.log(cost(problem, jax.nn.sigmoid(theta), data) + 1e-8)
 
 
 def _loss_forward(problem: Problem, theta: Array, data: Data) -> tuple[Array, tuple[Array, Data]]:
@@ -399,41 +406,6 @@ def _descend(problem: Problem, theta: Array, data: Data, iterations: int, method
         return jax.vmap(jax.vmap(one, in_axes=(0, None)))(theta, data)
 
 
-@partial(jax.jit, static_argnames=("problem",))
-def _differential_evolution(
-    problem: Problem, u: Array, data: Data, key: Key[Array, ""], generations: int
-) -> tuple[Array, Array]:
-    """best/1/bin with dithering from populations `u [D, M, P]` in the unit box; best points and costs."""
-    size = u.shape[-2]
-
-    def evolve(u: Array, key: Array, data: Data) -> tuple[Array, Array]:
-        def generation(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-            u, costs = carry
-            keys = jax.random.split(jax.random.fold_in(key, k), 5)
-            # Two others, unlike each other and the member itself: offsets around the circle.
-            one = jax.random.randint(keys[0], (size,), 1, size)
-            other = 1 + (one - 1 + jax.random.randint(keys[1], (size,), 1, size - 1)) % (size - 1)
-            at = jnp.arange(size)
-            strength = jax.random.uniform(keys[2], (), u.dtype, 0.5, 1.0)
-            best = jnp.broadcast_to(u[jnp.argmin(costs)], u.shape)
-            mutant = best + strength * (u[(at + one) % size] - u[(at + other) % size])
-            inside = (mutant >= 0) & (mutant <= 1)
-            mutant = jnp.where(inside, mutant, jax.random.uniform(keys[3], u.shape, u.dtype))
-            cross = jax.random.uniform(keys[4], (size, u.shape[-1] + 1), u.dtype)
-            forced = jnp.floor(cross[:, -1:] * u.shape[-1]) == jnp.arange(u.shape[-1], dtype=u.dtype)[None]
-            trial = jnp.where((cross[:, :-1] < 0.7) | forced, mutant, u)
-            found = jax.vmap(lambda one: _cost(problem, one, data))(trial)
-            better = found <= costs
-            return jnp.where(better[:, None], trial, u), jnp.where(better, found, costs)
-
-        first = (u, jax.vmap(lambda one: _cost(problem, one, data))(u))
-        u, costs = jax.lax.fori_loop(0, generations, generation, first)
-        best = jnp.argmin(costs)
-        return u[best], costs[best]
-
-    return jax.vmap(evolve)(u, jax.random.split(key, u.shape[0]), data)
-
-
 # --- the interface -----------------------------------------------------------------------------------
 
 
@@ -441,7 +413,7 @@ def _differential_evolution(
 class Fit:
     """Best parameters of every driver."""
 
-    model: str
+    model: CarFollowing
     objective: str
     method: str
     drivers: tuple[str, ...]
@@ -457,7 +429,7 @@ class Fit:
 
 def fit(
     segments: Sequence[Segment],
-    model: str = "idm",
+    model: CarFollowing = IDM(),
     *,
     objective: str = "mixed",
     method: str = "lm",
@@ -470,21 +442,19 @@ def fit(
 
     Args:
       segments: of all drivers, from `cleaning.segments`.
-      model: "idm", "iidm" or "acc".
+      model: of car following.
       objective: what to make least; `residuals` says what they are.
       method: see the module.
-      starts: descents per driver, each from the best of 32 quasi-random points; not for "de". Default: 8
+      starts: descents per driver, each from the best of 32 quasi-random points. Default: 8
         with the IDM, 16 with the others, whose kinks give them more local minima.
-      iterations: at most, from the best start; of "de" generations. Default: 80 (lm), 60 (lbfgs), 300
-        (adam), 100 (de).
+      iterations: at most, from the best start. Default: 80 (lm), 60 (lbfgs), 300 (adam).
       seed: of the random points.
       samples: see `stack`.
 
     Raises:
-      ValueError: no segments, or an unknown model, objective or method.
+      ValueError: no segments, or an unknown objective or method.
     """
     for what, value, known in (
-        ("model", model, tuple(MODELS)),
         ("objective", objective, OBJECTIVES),
         ("method", method, METHODS),
     ):
@@ -492,7 +462,7 @@ def fit(
             raise ValueError(f"{what} '{value}' is unknown; known are {', '.join(known)}")
     begin = time.perf_counter()
     drivers, data, dt = stack(segments, samples)
-    u, costs = solve(Problem(MODELS[model], objective, dt), data, method, starts, iterations, seed)
+    u, costs = solve(Problem(model, objective, dt), data, method, starts, iterations, seed)
     best = np.argmin(costs, axis=-1)
     rows = np.arange(len(drivers))
     return Fit(
@@ -519,16 +489,9 @@ def solve(
     iterations: int | None,
     seed: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points of the unit box `[D, S, P]` and mean squares `[D, S]` of all descents; of "de", S = 1."""
+    """Points of the unit box `[D, S, P]` and mean squares `[D, S]` of all descents."""
     data = jax.tree.map(jnp.asarray, data)
     count, size = data.gap.shape[0], len(PARAMETERS)
-    if method == "de":
-        members = 15 * size
-        u = qmc.LatinHypercube(size, rng=seed).random(members * count).reshape(count, members, size)
-        u, costs = _differential_evolution(
-            problem, jnp.asarray(u, jnp.float32), data, jax.random.key(seed), iterations or 100
-        )
-        return np.asarray(u, float)[:, None], np.asarray(costs, float)[:, None]
     starts = (8 if isinstance(problem.model, IDM) else 16) if starts is None else starts
     # The best of each of several sets of points that cover the box; the best of all would lie together.
     points = qmc.Sobol(size, rng=seed).random_base2(max(32 * starts - 1, 1).bit_length())
@@ -580,9 +543,11 @@ __all__ = [
     "Prior",
     "Problem",
     "boxed",
+    "cost",
     "driver",
     "errors",
     "fit",
+    "model_name",
     "refine",
     "residuals",
     "rollout",

@@ -20,6 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from cmaes import CMA
 from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
@@ -96,7 +97,7 @@ def match(
     names = tuple(start)
     if set(bounds) != set(names) or not names:
         raise ValueError(
-            f"bounds of {', '.join(bounds)}; of {', '.join(names)}, as the start, would be right"
+            f"bounds of {', '.join(bounds)}; bounds of {', '.join(names)}, as the start, are expected"
         )
     if not targets:
         raise ValueError("no targets; at least one statistic is needed")
@@ -125,12 +126,15 @@ def match(
     best: tuple[float, Floats, Floats] = (math.inf, origin, goal * np.nan)
     before: tuple[float, Floats] | None = None
     history = []
-    search = _Search(origin, width, members, np.random.default_rng(seed))
+    size = max(len(names), 2)  # CMA-ES wants two; the second of one means nothing
+    mean = np.append(origin, np.full(size - len(names), 0.5))
+    box = np.tile([0.0, 1.0], (size, 1))
+    search = CMA(mean, width, bounds=box, seed=seed, population_size=members)
     for generation in range(generations):
-        points = search.ask()
-        inside = np.clip(points, 0, 1)
+        points = np.stack([search.ask() for _ in range(members)])
         if generation == 0:
-            inside[0] = points[0] = origin
+            points[0] = mean
+        inside = points[:, : len(names)]
         found = simulate(real(inside))
         missing = [name for name in targets if name not in found]
         if missing:
@@ -143,8 +147,7 @@ def match(
         off = np.sum(((values - goal) / scale) ** 2, axis=-1)
         off = np.where(np.isfinite(off), off, _WORST)
         cost = off + tame * np.sum((inside - origin) ** 2, axis=-1)
-        # who left the box comes back
-        search.tell(points, cost + np.sum((points - inside) ** 2, axis=-1) * (1 + np.median(cost)))
+        search.tell(list(zip(points, cost.tolist(), strict=True)))
         if before is None:
             before = math.sqrt(off[0]), values[0]
         k = int(np.argmin(cost))
@@ -163,54 +166,6 @@ def match(
         history=np.sqrt(np.asarray(history)),
         evaluations=members * generations,
     )
-
-
-class _Search:
-    """CMA-ES with rank-one and rank-mu updates and the default weights of its tutorial."""
-
-    def __init__(self, mean: Floats, sigma: float, members: int, rng: np.random.Generator) -> None:
-        n, mu = len(mean), members // 2
-        weights = math.log((members + 1) / 2) - np.log(np.arange(1, mu + 1))
-        self.weights = weights / weights.sum()
-        self.effective = 1 / np.sum(self.weights**2)
-        m = self.effective
-        self.c_sigma = (m + 2) / (n + m + 5)
-        self.damping = 1 + 2 * max(0.0, math.sqrt((m - 1) / (n + 1)) - 1) + self.c_sigma
-        self.c_path = (4 + m / n) / (n + 4 + 2 * m / n)
-        self.c_one = 2 / ((n + 1.3) ** 2 + m)
-        self.c_mu = min(1 - self.c_one, 2 * (m - 2 + 1 / m) / ((n + 2) ** 2 + m))
-        self.expected = math.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n * n))  # length of a normal vector
-        self.mean, self.sigma, self.members, self.rng = mean, sigma, members, rng
-        self.covariance = np.eye(n)
-        self.path_sigma, self.path = np.zeros(n), np.zeros(n)
-        self.generation = 0
-
-    def ask(self) -> Floats:
-        """Candidates."""
-        root = np.linalg.cholesky(self.covariance)
-        z = self.rng.normal(size=(self.members, len(self.mean)))
-        return self.mean + self.sigma * z @ root.T
-
-    def tell(self, points: Floats, cost: Floats) -> None:
-        """Move towards the better half."""
-        self.generation += 1
-        steps = (points[np.argsort(cost)[: len(self.weights)]] - self.mean) / self.sigma
-        step = self.weights @ steps
-        values, vectors = np.linalg.eigh(self.covariance)
-        white = vectors @ ((vectors.T @ step) / np.sqrt(np.maximum(values, 1e-12)))
-        c, n = self.c_sigma, len(self.mean)
-        self.path_sigma = (1 - c) * self.path_sigma + math.sqrt(c * (2 - c) * self.effective) * white
-        length = float(np.linalg.norm(self.path_sigma))
-        grown = length / math.sqrt(1 - (1 - c) ** (2 * self.generation))
-        steady = grown < (1.4 + 2 / (n + 1)) * self.expected
-        c = self.c_path
-        self.path = (1 - c) * self.path + steady * math.sqrt(c * (2 - c) * self.effective) * step
-        one = np.outer(self.path, self.path) + (not steady) * c * (2 - c) * self.covariance
-        rank = (self.weights[:, None] * steps).T @ steps
-        keep = 1 - self.c_one - self.c_mu
-        self.covariance = keep * self.covariance + self.c_one * one + self.c_mu * rank
-        self.mean = self.mean + self.sigma * step
-        self.sigma *= math.exp(self.c_sigma / self.damping * (length / self.expected - 1))
 
 
 # --- the engine --------------------------------------------------------------------------------------

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from limsim_jax.calibration.cleaning import Segment
 from limsim_jax.calibration.fit import (
     LOWER,
-    MODELS,
     PARAMETERS,
     UPPER,
     Data,
@@ -36,6 +35,7 @@ from limsim_jax.calibration.fit import (
     Prior,
     Problem,
     driver,
+    model_name,
     refine,
     rollout,
     stack,
@@ -76,7 +76,7 @@ class Law:
     posterior_mean: Floats  # [D P], of log-parameters
     posterior_covariance: Floats  # [D P P]
     identified: Floats  # [P], share of the drivers
-    model: str
+    model: CarFollowing
     objective: str
     residual: Residual
 
@@ -123,7 +123,7 @@ def estimate(fit: Fit, segments: Sequence[Segment], *, rounds: int = 3, samples:
     pull = np.einsum("dij,dj->di", information, log_p)
     mean, covariance, posterior, spread = _expectation_maximisation(information, pull)
     drivers, data, dt = stack(segments, samples)
-    problem = Problem(MODELS[fit.model], fit.objective, dt)
+    problem = Problem(fit.model, fit.objective, dt)
     for _ in range(rounds):
         parameters = refine(
             problem, data, np.exp(posterior), _prior(mean, covariance, found, data)
@@ -145,7 +145,7 @@ def estimate(fit: Fit, segments: Sequence[Segment], *, rounds: int = 3, samples:
         identified=identified,
         model=fit.model,
         objective=fit.objective,
-        residual=residual_process(MODELS[fit.model], parameters, data, dt),
+        residual=residual_process(fit.model, parameters, data, dt),
     )
 
 
@@ -278,7 +278,7 @@ def predictive_check(
         parameters = law.sample(len(drivers) * draws, rng).reshape(len(drivers), draws, -1)
     gaps = np.asarray(
         _predictions(
-            MODELS[law.model],
+            law.model,
             jnp.asarray(parameters, jnp.float32),
             jax.tree.map(jnp.asarray, data),
             dt,
@@ -382,7 +382,7 @@ def write_population(
     content = {
         "format": FORMAT,
         "sources": [Path(source).name for source in sources],
-        "model": law.model,
+        "model": model_name(law.model),
         "objective": law.objective,
         "drivers": len(law.drivers),
         "classes": list(classes),

@@ -15,17 +15,18 @@ from numpy.typing import NDArray
 from limsim_jax.calibration.cleaning import SHORTEST, Quality, Segment, segments, split_in_time
 from limsim_jax.calibration.fit import (
     LOWER,
-    MODELS,
     PARAMETERS,
     UPPER,
     Fit,
     errors,
     fit,
+    model_name,
     stack,
 )
 from limsim_jax.calibration.population import Law, estimate, predictive_check, write_population
 from limsim_jax.calibration.uncertainty import Uncertainty, uncertainty
 from limsim_jax.recordings import Recording, RecordingError, Source, as_recording
+from limsim_jax.traffic.car_following import IDM, CarFollowing
 
 PUBLISHED = (0.11, 0.29)
 """Errors of calibrated car-following models, the IDM among them (Kesting, Treiber 2008)."""
@@ -95,7 +96,7 @@ class Calibration:
             "median_of_others": self.of_others,
         }
         return {
-            "model": self.fit.model,
+            "model": model_name(self.fit.model),
             "objective": self.fit.objective,
             "method": self.fit.method,
             "files": [quality.as_json() for quality in self.quality],
@@ -131,7 +132,10 @@ class Calibration:
             lines += [f"  {finding}" for finding in quality.findings[:5]]
             if len(quality.findings) > 5:
                 lines.append(f"  and {len(quality.findings) - 5} more")
-        lines += ["", f"{self.fit.model.upper()}, objective {self.fit.objective}, {self.fit.method}"]
+        lines += [
+            "",
+            f"{model_name(self.fit.model).upper()}, objective {self.fit.objective}, {self.fit.method}",
+        ]
         lines.append(f"{'':34}{'median':>8}{'quartiles':>16}{'gap, m':>10}")
         for name, part in (
             ("calibration, first part of the time", self.calibrated),
@@ -210,7 +214,7 @@ def gather(
 def calibrate(
     sources: Source | Sequence[Source],
     *,
-    model: str = "idm",
+    model: CarFollowing = IDM(),
     objective: str = "mixed",
     method: str = "lm",
     shortest: float = SHORTEST,
@@ -222,9 +226,9 @@ def calibrate(
 
     Args:
       sources: one or more recordings, or their files.
-      model: "idm", "iidm" or "acc".
+      model: of car following.
       objective: what to make least, see `fit.residuals`.
-      method: "lm", "lbfgs", "adam" or "de".
+      method: "lm", "lbfgs" or "adam".
       shortest: s, segments of less are left out.
       first: share of every driver's time that is calibrated with where the rest validates.
       starts: descents per driver, see `fit`.
@@ -281,7 +285,7 @@ def _errors(found: Fit, parts: Sequence[Segment], samples: int = 0) -> dict[str,
     """Objectives of every driver of `parts`, with its fitted parameters."""
     drivers, data, dt = stack(parts, samples)
     parameters = found.parameters[[found.drivers.index(name) for name in drivers]]
-    result = errors(MODELS[found.model], jnp.asarray(parameters, jnp.float32), data, dt)
+    result = errors(found.model, jnp.asarray(parameters, jnp.float32), data, dt)
     return {name: np.asarray(values, float) for name, values in result.items()}
 
 

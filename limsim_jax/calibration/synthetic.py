@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limsim_jax.calibration.cleaning import Segment
-from limsim_jax.calibration.fit import MODELS, PARAMETERS, Data, rollout
+from limsim_jax.calibration.fit import PARAMETERS, Data, rollout
+from limsim_jax.traffic.car_following import IDM, CarFollowing
 
 TYPICAL = (16.0, 1.2, 2.2, 1.3, 2.0)
 """v0, T, s0, a, b in towns."""
@@ -37,7 +38,7 @@ def follow(
     dt: float = 0.1,
     noise: float = 0.3,
     memory: float = 0.95,
-    model: str = "idm",
+    model: CarFollowing = IDM(),
 ) -> list[Segment]:
     """One segment per driver, behind leaders that cruise, crawl, stop and start.
 
@@ -48,7 +49,7 @@ def follow(
       dt: s.
       noise: m, standard deviation of the error of the gap.
       memory: its correlation from one sample to the next.
-      model: that drives.
+      model: of car following, that drives.
     """
     lead = np.stack([leader_speed(samples, dt, rng) for _ in parameters])
     start = np.zeros(lead.shape)
@@ -63,7 +64,7 @@ def follow(
         "weight": np.ones(lead.shape),
     }
     data = Data(**{name: jnp.asarray(x, jnp.float32) for name, x in values.items()})
-    run = jax.jit(jax.vmap(lambda p, data: rollout(MODELS[model], p, data, dt)))
+    run = jax.jit(jax.vmap(lambda p, data: rollout(model, p, data, dt)))
     gap, v = (np.asarray(x, float) for x in run(jnp.asarray(parameters, jnp.float32), data))
     error = np.empty(lead.shape)
     error[:, 0] = rng.normal(0, noise, len(lead))

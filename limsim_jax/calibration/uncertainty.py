@@ -29,7 +29,6 @@ from scipy.stats import t as student
 from limsim_jax.calibration.cleaning import Segment
 from limsim_jax.calibration.fit import (
     LOWER,
-    MODELS,
     PARAMETERS,
     UPPER,
     Data,
@@ -79,7 +78,7 @@ def uncertainty(fit: Fit, segments: Sequence[Segment], *, samples: int = 0) -> U
     # Nearly singular matrices: double precision for the derivatives.
     with jax.enable_x64(True):
         wide = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), data)
-        problem = Problem(MODELS[fit.model], fit.objective, dt)
+        problem = Problem(fit.model, fit.objective, dt)
         r, jacobian = _sensitivity(problem, jnp.asarray(fit.parameters), wide)
         r, jacobian = np.asarray(r), np.asarray(jacobian)
     counts, starts = np.asarray(data.weight) > 0, np.asarray(data.start) > 0

@@ -24,7 +24,7 @@ def calibrate(
         typer.Option(help="What to make least."),
     ] = "mixed",
     method: Annotated[
-        Literal["lm", "lbfgs", "adam", "de"], typer.Option(help="Optimiser; lm: Levenberg-Marquardt.")
+        Literal["lm", "lbfgs", "adam"], typer.Option(help="Optimiser; lm: Levenberg-Marquardt.")
     ] = "lm",
     shortest: Annotated[float, typer.Option(help="Leave out what is shorter, s.")] = 20.0,
     seed: Annotated[int, typer.Option(help="Of all that is random.")] = 0,
@@ -58,6 +58,7 @@ def calibrate(
         linked_recordings,
         single_fits,
     )
+    from limsim_jax.calibration.fit import MODELS
     from limsim_jax.calibration.report import calibrate as fit
     from limsim_jax.calibration.report import gather
     from limsim_jax.files import write_whole
@@ -72,7 +73,8 @@ def calibrate(
     linked = linked_recordings(recordings, period=period) if closed_loop else None
     if linked is not None:
         hold_out(linked)  # refuses what has one period only, before anything is fitted
-    found = fit(recordings, model=model, objective=objective, method=method, shortest=shortest, seed=seed)
+    driven = MODELS[model]
+    found = fit(recordings, model=driven, objective=objective, method=method, shortest=shortest, seed=seed)
     print(found.text())
     result, content = found, found.as_json()
     if linked is not None:
@@ -81,9 +83,9 @@ def calibrate(
             linked,
             gather(recordings, shortest=shortest)[0],
             population=partial(
-                single_fits, model=model, objective=objective, method=method, starts=None, seed=seed
+                single_fits, model=driven, objective=objective, method=method, starts=None, seed=seed
             ),
-            model=model,
+            model=driven,
             speed_limit=speed_limit or SPEED_LIMIT,
             seed=seed,
         )

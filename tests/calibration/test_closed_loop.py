@@ -9,26 +9,21 @@ import numpy as np
 import pytest
 from scipy.stats import wasserstein_distance
 
-from limsim_jax.calibration import closed_loop
 from limsim_jax.calibration.cleaning import Segment
-from limsim_jax.calibration.closed_loop import (
-    Distances,
-    calibrate_closed_loop,
+from limsim_jax.calibration.closed_loop import Distances, calibrate_closed_loop, hold_out, link, simulate
+from limsim_jax.calibration.closed_loop.descent import drawn, scores
+from limsim_jax.calibration.closed_loop.distances import (
     distances,
-    drawn,
+    edie,
     floor,
     from_own,
     headway,
-    hold_out,
-    link,
-    outside,
     samples,
-    scores,
-    simulate,
     simulate_samples,
     wasserstein,
 )
-from limsim_jax.calibration.fit import MODELS, PARAMETERS, rollout, stack
+from limsim_jax.calibration.closed_loop.validation import outside
+from limsim_jax.calibration.fit import MODELS, PARAMETERS, driver, rollout, stack
 from limsim_jax.calibration.matching import match, scaled, write_scaled
 from limsim_jax.calibration.population import Law, Residual
 from limsim_jax.calibration.synthetic import TYPICAL, leader_speed
@@ -54,7 +49,7 @@ def law(median, spread):
     return Law(
         mean=np.log(median), covariance=np.diag(np.square(spread)), drivers=("a", "b", "c"),
         posterior_mean=np.zeros((3, count)), posterior_covariance=np.zeros((3, count, count)),
-        identified=np.full(count, 0.8), model="acc", objective="gap", residual=Residual(sigma=0.2, tau=1.5),
+        identified=np.full(count, 0.8), model=MODEL, objective="gap", residual=Residual(sigma=0.2, tau=1.5),
     )  # fmt: skip
 
 
@@ -133,8 +128,6 @@ def test_refuses():
     linked = link(table(), period=4.0)
     with pytest.raises(ValueError, match="distance 'flux' is unknown; known are headway"):
         calibrate_closed_loop(linked, table(), weights={"flux": 1.0})
-    with pytest.raises(ValueError, match="model 'gipps' is unknown"):
-        calibrate_closed_loop(linked, table(), model="gipps")
     with pytest.raises(ValueError, match=r"^2 drivers to fit; at least 3 are needed"):
         calibrate_closed_loop(linked, table()[:2])
     with pytest.raises(ValueError, match=r"^1 turns\? at least 2"):
@@ -205,7 +198,7 @@ def test_positions_agree_across_changes_of_the_leader():
     p = np.asarray([TYPICAL, (20.0, 1.8, 3.0, 1.0, 1.5)])
     gap, v = (np.asarray(x, float) for x in follow(jnp.asarray(p, jnp.float32), chains))
 
-    who = [closed_loop.driver(jnp.asarray(row, jnp.float32)) for row in p]
+    who = [driver(jnp.asarray(row, jnp.float32)) for row in p]
     drive = jax.jit(
         lambda who, gap, v, v_lead, a_lead: MODEL(
             who[0], gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=who[1]
@@ -264,7 +257,7 @@ def test_distances_of_known_changes():
     # all flows rise by density x 1.5 m/s
     assert faster.flow == pytest.approx(3600 * 1.5 * float(jnp.mean(recorded.density)), rel=0.05)
     # Edie: six vehicles, 10 to 25 m and a car's length apart, all the time
-    k, q = closed_loop._edie(recorded, recorded.gap[None], recorded.v[None], points)
+    k, q = edie(recorded, recorded.gap[None], recorded.v[None], points)
     assert np.allclose(k, 6 / (6 * 22.0), rtol=1e-5) and np.allclose(q, 60.0 / 132.0, rtol=1e-5)
     # bodies that overlap, and standing, leave finite headways
     assert float(headway(jnp.float32(-3), jnp.float32(0), jnp.float32(4.5))) == pytest.approx(4.5)
@@ -424,7 +417,7 @@ def test_match_refuses():
         match(nothing, {"flux": 1.0}, start, bounds)
     with pytest.raises(ValueError, match=r"T: start 3, bounds 0\.5 to 2"):
         match(nothing, {"flow": 1.0}, {"T": 3.0}, bounds)
-    with pytest.raises(ValueError, match="bounds of a; of T, as the start"):
+    with pytest.raises(ValueError, match="bounds of a; bounds of T, as the start"):
         match(nothing, {"flow": 1.0}, start, {"a": (0.0, 1.0)})
     with pytest.raises(ValueError, match="no targets"):
         match(nothing, {}, start, bounds)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from differential_evolution import fit_by_evolution
 from paths import SHARED, needs_shared
 from scipy.optimize import differential_evolution
 
@@ -37,7 +38,7 @@ def known():
     rng = np.random.default_rng(3)
     truth = drivers(96, 0.12, rng)
     recorded = follow(truth, rng)
-    return truth, recorded, fit(recorded, "idm", objective="gap")
+    return truth, recorded, fit(recorded, objective="gap")
 
 
 def segment(gap, v, v_lead, driver="one", dt=DT):
@@ -169,7 +170,7 @@ def test_what_data_cannot_tell_is_flagged():
         )
         for one in recorded
     ]
-    found = fit(noisy, "idm", objective="gap", samples=896)
+    found = fit(noisy, objective="gap", samples=896)
     sure = uncertainty(found, noisy)
     names = np.asarray(PARAMETERS)
     for i in range(3):
@@ -182,8 +183,8 @@ def test_what_data_cannot_tell_is_flagged():
 def test_gradients_find_what_differential_evolution_finds(known):
     _, recorded, _ = known
     some = recorded[:12]
-    here = fit(some, "idm", objective="mixed")
-    there = fit(some, "idm", objective="mixed", method="de", seed=1)
+    here = fit(some)
+    there = fit_by_evolution(some, seed=1)
     assert (here.error <= 1.01 * there.error).all()
     assert here.seconds > 0 and here.drivers == there.drivers
     # and what SciPy's finds, on its own
@@ -208,10 +209,9 @@ def test_gradients_find_what_differential_evolution_finds(known):
 @pytest.mark.parametrize("method", ["adam", "lbfgs"])
 def test_other_methods_agree(method, known):
     _, recorded, _ = known
-    here = fit(recorded[:3], "idm", objective="gap")
+    here = fit(recorded[:3], objective="gap")
     there = fit(
         recorded[:3],
-        "idm",
         objective="gap",
         method=method,
         starts=2,
@@ -223,21 +223,19 @@ def test_other_methods_agree(method, known):
 
 def test_a_fit_does_not_depend_on_who_else_is_fitted(known):
     _, recorded, found = known
-    alone = fit(recorded[7:10], "idm", objective="gap")
+    alone = fit(recorded[7:10], objective="gap")
     np.testing.assert_allclose(alone.error, found.error[7:10], rtol=1e-3)
     np.testing.assert_allclose(alone.parameters, found.parameters[7:10], rtol=2e-2)
 
 
 def test_arguments_are_checked(known):
     _, recorded, _ = known
-    with pytest.raises(ValueError, match="model 'gipps' is unknown; known are idm, iidm, acc"):
-        fit(recorded, "gipps")
     with pytest.raises(ValueError, match="objective 'rmse' is unknown"):
-        fit(recorded, "idm", objective="rmse")
+        fit(recorded, objective="rmse")
     with pytest.raises(ValueError, match="method 'ga' is unknown"):
-        fit(recorded, "idm", method="ga")
+        fit(recorded, method="ga")
     with pytest.raises(ValueError, match="no segments"):
-        fit([], "idm")
+        fit([])
     with pytest.raises(ValueError, match=r"steps of 0.1, 0.2 s"):
         stack([recorded[0], segment(9.0, 3.0, np.full(50, 3.0), dt=0.2)])
 
@@ -250,7 +248,7 @@ def test_real_followers_are_fitted_as_well_as_by_differential_evolution(model):
     path = SHARED / "trajectories" / "ngsim_i80_0400_pairs.csv.gz"
     recorded, _ = segments(read_recording(path))
     some = recorded[::8]  # 12 of 94
-    here = fit(some, model, samples=896)  # as above: one program for both
-    there = fit(some, model, method="de", samples=896)
+    here = fit(some, MODELS[model], samples=896)  # as above: one program for both
+    there = fit_by_evolution(some, MODELS[model], samples=896)
     assert (here.error <= 1.01 * there.error).all()
     assert 0.05 < np.median(here.error) < 0.29  # published: 11 to 29 %

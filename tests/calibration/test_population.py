@@ -39,7 +39,7 @@ def known():
     rng = np.random.default_rng(11)
     truth = np.exp(rng.multivariate_normal(np.log(TYPICAL), COVARIANCE, 96))
     recorded = follow(truth, rng)
-    found = fit(recorded, "idm", objective="gap")
+    found = fit(recorded, objective="gap")
     return truth, recorded, estimate(found, recorded, rounds=1)
 
 
@@ -53,7 +53,7 @@ def law(residual=None):
         posterior_mean=rng.multivariate_normal(np.log(TYPICAL), COVARIANCE, 2),
         posterior_covariance=np.tile(COVARIANCE / 100, (2, 1, 1)),
         identified=np.array([0.9, 0.8, 0.7, 0.6, 0.2]),
-        model="idm",
+        model=MODELS["idm"],
         objective="gap",
         residual=residual or Residual(sigma=0.2, tau=1.5),
     )
@@ -222,8 +222,8 @@ def test_too_little_is_refused(tmp_path):
         calibrate(tmp_path / "x.csv")
     two = np.tile(TYPICAL, (2, 1))
     found = Fit(
-        model="idm", objective="gap", method="lm", drivers=("a", "b"), parameters=two, error=np.ones(2),
-        starts=np.ones((2, 1)), seconds=0.0,
+        model=MODELS["idm"], objective="gap", method="lm", drivers=("a", "b"), parameters=two,
+        error=np.ones(2), starts=np.ones((2, 1)), seconds=0.0,
     )  # fmt: skip
     with pytest.raises(ValueError, match="population from 2 drivers"):
         estimate(found, [])
