@@ -292,7 +292,7 @@ def _levenberg_marquardt(
     def normal(u: Array, data: Data, prior: Prior | None) -> tuple[Array, Array, Array]:
         return _normal_equations(problem, u, data, prior)
 
-    def cost(u: Array, data: Data, prior: Prior | None) -> Array:
+    def cost_at(u: Array, data: Data, prior: Prior | None) -> Array:
         return cost(problem, u, data, prior)
 
     def over_starts(f: Any) -> Any:
@@ -317,7 +317,7 @@ def _levenberg_marquardt(
         count, now = carry
         here, g, h = over_starts(normal)(now.u, data, prior)
         tried = jax.vmap(jax.vmap(propose))(now.u, g, h, now.damping)  # [D, S, K, P]
-        found = over_starts(jax.vmap(cost, in_axes=(0, None, None)))(tried, data, prior)  # [D, S, K]
+        found = over_starts(jax.vmap(cost_at, in_axes=(0, None, None)))(tried, data, prior)  # [D, S, K]
         best, least = jnp.argmin(found, axis=-1), jnp.min(found, axis=-1)
         better = least < here
         u = jnp.take_along_axis(tried, best[..., None, None], axis=2)[:, :, 0]

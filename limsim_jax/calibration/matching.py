@@ -210,7 +210,7 @@ class TrafficFlow:
         del lane_map
         return TrafficMetrics(config.dt).init(state.lane.shape[0], len(self.detectors))
 
-    def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> TrafficStep:
+    def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> TrafficStep:
         """A physics step of the traffic."""
         del config, lane_map
         state, nobody = tick.state, jnp.zeros_like(tick.left)
@@ -220,7 +220,7 @@ class TrafficFlow:
         )  # fmt: skip
 
     def update(
-        self, config: Config, lane_map: LaneMap, carry: TrafficCarry, looks: TrafficStep
+        self, config: Config, lane_map: LaneMap, carry: TrafficCarry, records: TrafficStep
     ) -> TrafficCarry:
         """The steps since the last decision."""
         del lane_map
@@ -228,13 +228,13 @@ class TrafficFlow:
         lane, s = ([row[k] for row in self.detectors] for k in (0, 1))
         places = Detectors(jnp.asarray(lane, jnp.int32), jnp.asarray(s, jnp.float32))
 
-        def step(carry: TrafficCarry, look: TrafficStep) -> tuple[TrafficCarry, None]:
-            beside = look.active & carry.active & (look.lane != carry.lane) & (look.s > look.dx)
-            new = metrics.update(carry, places, look._replace(changed=beside))
-            waits = look.t < self.begin
+        def step(carry: TrafficCarry, now: TrafficStep) -> tuple[TrafficCarry, None]:
+            beside = now.active & carry.active & (now.lane != carry.lane) & (now.s > now.dx)
+            new = metrics.update(carry, places, now._replace(changed=beside))
+            waits = now.t < self.begin
             return jax.tree.map(lambda x, y: jnp.where(waits, x, y), carry, new), None
 
-        return lax.scan(step, carry, looks)[0]
+        return lax.scan(step, carry, records)[0]
 
     def result(self, config: Config, lane_map: LaneMap, carry: TrafficCarry) -> dict[str, Measured]:
         """All of `metrics.traffic.NAMES`, and with detectors `saturation_flow_per_hour`, over all of them."""
