@@ -1,4 +1,4 @@
-"""Put the figures of experiments/results/ into the README.
+"""Put the figures of experiments/results/ into the pages of docs/results/ and the README.
 
 python experiments/readme_tables.py           write them
 python experiments/readme_tables.py --check   fail unless they are there already
@@ -307,28 +307,63 @@ TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
 }
 
 
-def with_tables(text: str) -> str:
-    """The text with the tables of all results between their comments."""
-    for name, table in TABLES.items():
-        result = json.loads((REPO / "experiments" / "results" / f"{name}.json").read_text())
-        begin, end = f"<!-- {name} -->\n", f"\n<!-- end of {name} -->"
+def success(result: dict[str, Any]) -> str:
+    """For the README: policies down, scenarios across, the share of successes with its interval."""
+    rows = result["rows"]
+    scenarios, policies = (list(dict.fromkeys(r[name] for r in rows)) for name in ("scenario", "policy"))
+    lines = [f"| policy | {' | '.join(scenarios)} |", f"|---|{'---|' * len(scenarios)}"]
+    for policy in policies:
+        cells = []
+        for scenario in scenarios:
+            (found,) = (r["success"] for r in rows if (r["scenario"], r["policy"]) == (scenario, policy))
+            share, low, high = (100 * x for x in found)
+            cells.append(f"{share:.1f} [{low:.1f}, {high:.1f}]")
+        lines.append(f"| `{policy}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+README: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {"success": ("policies", success)}
+"""Tables of the README: the name of the place, the result, and what makes the table."""
+
+
+def places() -> dict[Path, dict[str, str]]:
+    """The tables of every page, by the name of their place."""
+    found = {
+        REPO / "docs" / "results" / f"{name}.md": {name: table(read(name))} for name, table in TABLES.items()
+    }
+    found[REPO / "README.md"] = {name: table(read(result)) for name, (result, table) in README.items()}
+    return found
+
+
+def read(name: str) -> dict[str, Any]:
+    """A result."""
+    return json.loads((REPO / "experiments" / "results" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def with_tables(text: str, tables: dict[str, str]) -> str:
+    """The text with tables between their comments."""
+    for name, table in tables.items():
+        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
         before, opened, rest = text.partition(begin)
         _, closed, after = rest.partition(end)
         if not (opened and closed):
-            raise SystemExit(f"the README has no place for {name}")
-        text = before + begin + table(result) + end + after
+            raise SystemExit(f"no place for the table {name}")
+        text = f"{before}{begin}{table}\n{end}{after}"
     return text
 
 
 def main() -> int:
-    """Write the README, or compare."""
-    readme = REPO / "README.md"
-    text = readme.read_text()
-    made = with_tables(text)
-    if "--check" in sys.argv[1:]:
-        return 0 if made == text else 1
-    readme.write_text(made)
-    return 0
+    """Write the pages, or compare."""
+    checking, same = "--check" in sys.argv[1:], True
+    for page, tables in places().items():
+        text = page.read_text(encoding="utf-8")
+        made = with_tables(text, tables)
+        if checking and made != text:
+            print(f"{page.relative_to(REPO)}: not the figures of experiments/results/")
+            same = False
+        elif not checking:
+            page.write_text(made, encoding="utf-8")
+    return 0 if same else 1
 
 
 if __name__ == "__main__":

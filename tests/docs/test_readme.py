@@ -1,34 +1,41 @@
-"""The README's example runs and says the truth."""
+"""README and docs say what is there: links, figures, commands and lists."""
 
-import math
 import re
 import subprocess
 import sys
-import textwrap
+import tomllib
 
+import pytest
 from paths import REPO
 
 from limsim_jax.maps import bundled_maps
-from limsim_jax.policies import host
 
 README = (REPO / "README.md").read_text()
+SITE = sorted((REPO / "docs").rglob("*.md"))
+TOP = [REPO / name for name in ("README.md", "CONTRIBUTING.md", "ARCHITECTURE.md", "CHANGELOG.md")]
+PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
+
+GENERATED = {
+    *(
+        f"docs/reference/{name}.md"
+        for name in ("api", "cli", "experiment", "metrics", "parameters", "vehicles")
+    ),
+    *(f"docs/{name}.md" for name in ("architecture", "changelog", "contributing", "faq/index")),
+}
+"""Pages that are made when the site is built."""
 
 
-def test_example(capsys):
-    (code,) = re.findall(r"<!-- test: example -->\n```python\n(.*?)```", README, re.DOTALL)
-    names = {}
-    exec(compile(code, "README.md", "exec"), names)
-    assert "laneSection" in capsys.readouterr().out
-    assert abs(float(names["s"]) - 25.0) < 1e-3 and abs(float(names["d"]) - 0.5) < 1e-3
-    assert math.isclose(float(names["slope"]), math.cos(float(names["heading"])), abs_tol=1e-3)
+def _slug(heading):
+    return re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", heading.replace("`", "")).strip().lower())
 
 
-def test_own_policies_are_those_that_are_shown():
-    code = (REPO / "experiments" / "own_policies.py").read_text()
-    shown = re.findall(r"```python\n(@dataclass\(frozen=True\)\nclass Cautious\(.*?)```", README, re.DOTALL)
-    assert all(block in code for block in shown)
-    (shown,) = re.findall(r"( {4}def follow.*?)\n\n", host.__doc__ or "", re.DOTALL)
-    assert textwrap.dedent(shown) in code
+def _anchors(path):
+    return {_slug(heading) for heading in re.findall(r"^#+ (.*)$", path.read_text(), re.M)}
+
+
+def test_the_readme_fits_on_a_page():
+    assert len(README.splitlines()) <= 130
+    assert README.count("<!-- ci: ") == 2
 
 
 def test_figures_are_those_measured():
@@ -37,12 +44,54 @@ def test_figures_are_those_measured():
 
 
 def test_bundled_maps_are_listed():
+    text = (REPO / "docs" / "reference" / "maps.md").read_text()
     for name in bundled_maps():
-        assert f"`{name}`" in README
+        assert f"`{name}`" in text
 
 
-def test_pictures_and_tables_exist():
-    links = re.findall(r"\]\(([^)#]+)\)", README)
-    assert any(link.endswith(".png") for link in links)
+def test_links_of_the_readme_are_absolute_and_lead_to_files():
+    """So that they work on the package index as well."""
+    home = PROJECT["urls"]["Homepage"]
+    raw = home.replace("github.com", "raw.githubusercontent.com")
+    links = re.findall(r"\]\(([^)\s]+)\)", README)
+    assert any(link.endswith((".png", ".gif")) for link in links)
     for link in links:
-        assert link.startswith("https://") or (REPO / link).is_file(), link
+        found = re.match(rf"(?:{home}/blob|{home}/tree|{raw})/main/([^#]*)", link)
+        if found:
+            assert (REPO / found[1]).exists(), link
+        else:
+            assert link.startswith(("https://arxiv.org/", PROJECT["urls"]["Documentation"])), link
+
+
+@pytest.mark.parametrize("path", [*TOP[1:], *SITE], ids=lambda path: path.relative_to(REPO).as_posix())
+def test_links_lead_to_pages_and_headings(path):
+    text = re.sub(r"^```.*?^```", "", path.read_text(), flags=re.M | re.S)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if link.startswith("https://"):
+            continue
+        target, _, anchor = link.partition("#")
+        to = (path.parent / target).resolve() if target else path
+        name = to.relative_to(REPO).as_posix()
+        if name in GENERATED:
+            continue
+        if name.startswith("docs/notebooks/"):
+            to = REPO / name.removeprefix("docs/")
+        assert to.is_file(), f"{link} leads nowhere"
+        assert not anchor or anchor in _anchors(to), f"{link}: no such heading"
+
+
+def test_every_table_of_results_has_a_page():
+    made = {path.stem for path in (REPO / "experiments" / "results").glob("*.md")} - {"vehicle_parameters"}
+    assert made <= {path.stem for path in (REPO / "docs" / "results").glob("*.md")}
+
+
+def test_every_page_is_in_the_navigation():
+    text = (REPO / "mkdocs.yml").read_text()
+    for path in SITE:
+        assert path.relative_to(REPO / "docs").as_posix() in text
+
+
+def test_the_english_is_plain():
+    command = [sys.executable, ".ci/prose.py", *(str(path.relative_to(REPO)) for path in TOP), "docs"]
+    found = subprocess.run(command, cwd=REPO, capture_output=True, text=True)
+    assert found.returncode == 0, found.stdout
