@@ -42,6 +42,32 @@ UNITS = re.compile(
 """Units with which descriptions begin."""
 
 
+WORDS = {
+    "name": "of the experiment in results; the file's name unless told",
+    "description": "a sentence for reports",
+    "traffic": "all vehicles but the egos",
+    "ego": "the vehicle under test",
+    "flow": "vehicles that come in, one table per flow",
+    "goal": "where they go: a way out of the map, or shares of several; absent: shares by the map",
+    "pattern": "random arrivals, equal gaps, or groups",
+    "speed": "m/s; speed at which they come in, as fast as road and leader allow unless told",
+    "classes": "shares of vehicle classes; those of the traffic unless told",
+    "platoon": "vehicles in a group",
+    "headway": "s; time gap within a group",
+    "begin": "s; no vehicle comes in before",
+    "end": "s; no vehicle comes in from then on",
+    "model": "car following of the traffic",
+    "lane_changes": "whether the traffic changes lanes",
+    "after_collision": "what vehicles do after a contact: stop there, drive on, or end the episode",
+    "vehicle": "class of the ego",
+    "horizon": "s; length of an episode",
+    "min": "least value of the metric",
+    "max": "greatest value of the metric",
+    "metrics": "metrics of your own, by module and class",
+}
+"""Descriptions of fields that have none in the code."""
+
+
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """A table in Markdown."""
     header = list(header)
@@ -113,7 +139,7 @@ def experiment() -> str:
         'A file can also name others: `experiments = ["highway.toml", "ramp.toml"]`.',
     ]
     seen: set[type] = set()
-    waiting: list[tuple[str, type]] = [("", module.Experiment)]
+    waiting: list[tuple[str, type]] = [("", module.ExperimentFile)]
     titles = {"": "The file"}
     while waiting:
         path, model = waiting.pop(0)
@@ -125,7 +151,10 @@ def experiment() -> str:
         text += [first, ""] if path and first else []
         rows = []
         for name, kind, default, bounds, words in fields(model):
+            if not words or words in ("s", "m/s"):
+                words = WORDS.get(name, words)
             unit, words = split_unit(words)
+            words = _sentence(words)
             rows.append([f"`{name}`", kind_in_words(kind), default, bounds, unit, words])
             for inner, many in _tables_in(kind):
                 brackets = ("[[", "]]") if many else ("[", "]")
