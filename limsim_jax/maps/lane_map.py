@@ -1,21 +1,22 @@
 """Lanes as device arrays, and the look-ups on them.
 
-Each lane is cut into intervals of equal arc length `ds`, a power of two between 1/8 m and 16 m, so that
-`s / ds` and `i * ds` are exact in float32; the last interval takes the remainder (0.5 to 1.5 `ds`). The
-intervals of all lanes lie end to end in one pool, so a 10 km lane and a 5 m connector share one map. An
-interval is one row of 16 float32, a cache line: the cubic Hermite curve through the exact end poses, the
-width as a cubic, the curvature as a line. `ds` is per lane the largest that keeps the row within
-`rasterise.TOLERANCE` of the host lane.
+Each lane is cut into intervals of equal arc length `ds`, a power of two between 1/8 m and 16 m. `s / ds` and
+`i * ds` are thus exact in float32. The last interval takes the remainder (0.5 to 1.5 `ds`). The intervals of
+all lanes lie end to end in one pool, so a 10 km lane and a 5 m connector share one map.
+
+An interval is one row of 16 float32, a cache line: the cubic Hermite curve through the exact end poses, the
+width as a cubic, the curvature as a line. Each lane has the largest `ds` that keeps its rows within
+`rasterise.TOLERANCE` of the lane of the network.
 
 Look-ups take one `lane` and one `s`, or arrays of one shape. The last row of every array is an inert null
-lane, so `NO_LANE` may be used as an index everywhere. All are differentiable in everything but `lane`;
-where a lane is kinked, the gradient is that of the curve that rounds the kink.
+lane, so `NO_LANE` is a valid index everywhere. Look-ups are differentiable in everything but `lane`. Where a
+lane is kinked, the gradient is that of the curve that rounds the kink.
 
-Coordinates are relative to `LaneMap.origin`, a whole number of metres that is subtracted in float64:
-float32 resolves 0.25 mm within 4 km of it and 0.5 mm within 8 km. `absolute` gives file coordinates back.
+Coordinates are relative to `LaneMap.origin`, a whole number of metres that is subtracted in float64.
+float32 resolves 0.25 mm within 4 km of it and 0.5 mm within 8 km. `absolute` converts to file coordinates.
 
-Cost on one CPU core: a pose reads 12 B of lane table and 36 B of one row and is bound by arctan2 and these
-gathers; a local projection reads five rows and is bound by the dependent gathers of its Newton steps.
+Cost on one CPU core: a pose reads 12 B of lane table and 36 B of one row, and is bound by arctan2 and these
+gathers. A local projection reads five rows, and is bound by the dependent gathers of its Newton steps.
 """
 
 from __future__ import annotations
@@ -76,8 +77,8 @@ class LaneMap:
     ds: Float[Array, " L"]  # m, interval length
     length: Float[Array, " L"]  # m
     speed_limit: Float[Array, " L"]  # m/s
-    stop_s: Float[Array, " L"]  # m, where the front bumper stops: last stop line, else end of the lane
-    end_s: Float[Array, " L"]  # m, as far as a vehicle can go on a lane that leads nowhere: it may taper off
+    stop_s: Float[Array, " L"]  # m, where the front bumper stops: last stop line or end of the lane
+    end_s: Float[Array, " L"]  # m, where a lane without successors becomes too narrow; otherwise its length
     curvature_max: Float[Array, " L"]  # 1/m, largest |mean curvature| over any `rasterise.TURN_WINDOW`
     left: Int[Array, " L"]  # neighbour in the same direction
     right: Int[Array, " L"]
@@ -90,7 +91,7 @@ class LaneMap:
     lane_type: Int[Array, " L"]  # index into LANE_TYPES
     access: Int[Array, " L"]  # bit i: VEHICLE_CLASSES[i] may use it
     is_connector: Bool[Array, " L"]  # lies inside a junction
-    junction: Int[Array, " L"]  # index into the network's junctions, else -1
+    junction: Int[Array, " L"]  # index into the network's junctions, or -1
     valid: Bool[Array, " L"]  # False for the null lane and padding
     chunk_lane: Int[Array, " C"]  # short stretches of lane: what `project` compares
     chunk: Float[Array, "C 6"]  # m, first and last s; x, y of the first and of the last
@@ -100,11 +101,11 @@ class LaneMap:
     routes: RouteTable
     signals: SignalTable
     lanes_in_sight: int = struct.field(pytree_node=False, default=0)
-    """Lanes that a vehicle may have to look over to see `rasterise.SIGHT` m ahead."""
+    """Lanes that a vehicle may have to scan to see `rasterise.SIGHT` m ahead."""
 
 
 def lane_rows(network: Network) -> dict[str, int]:
-    """Row of every lane that motor traffic uses, by lane id, in file order."""
+    """Row of every drivable lane by lane id, in file order."""
     return {lane.id: row for row, lane in enumerate(network.drivable_lanes())}
 
 
@@ -114,7 +115,10 @@ def lane_ids(network: Network) -> list[str]:
 
 
 def bucket(count: int, least: int = 1) -> int:
-    """Least of 0, 1, 2, 3, 4, 6, 8, 12, 16, 24, ... that is below neither `count` nor `least`."""
+    """Size of a padded axis: 0, 1, 2, 3, 4, 6, 8, 12, 16, 24, ...
+
+    It is the least of these that is at least `count` and `least`. Few sizes mean few compilations.
+    """
     count = max(count, least)
     if count == 0:
         return 0
@@ -128,9 +132,18 @@ def bucket(count: int, least: int = 1) -> int:
 def pose(
     lane_map: LaneMap, lane: Index, s: Number, d: Number = 0.0
 ) -> tuple[Float[Array, "*#b"], Float[Array, "*#b"], Float[Array, "*#b"]]:
-    """Position x, y (m) at arc length `s` and lateral offset `d` (m, left > 0), and the lane's heading (rad).
+    """Cartesian position of a place on a lane.
 
-    Beyond its ends a lane goes on straight.
+    Beyond its ends a lane continues straight.
+
+    Args:
+        lane_map: the map.
+        lane: row of the lane.
+        s: arc length, m.
+        d: lateral offset, m, left > 0.
+
+    Returns:
+        x, y (m) in map coordinates, and the heading of the lane (rad).
     """
     s, d = _as_float(lane_map, s), _as_float(lane_map, d)
     row, u = _locate(lane_map, lane, s)
@@ -140,20 +153,26 @@ def pose(
 
 
 def curvature(lane_map: LaneMap, lane: Index, s: Number) -> Float[Array, "*#b"]:
-    """Curvature of the centre line, 1/m, positive where it bends left; beyond the ends that of the end."""
+    """Curvature of the centre line, 1/m, positive in a left bend.
+
+    Beyond the ends of the lane it is that of the end.
+    """
     row, u = _locate(lane_map, lane, _as_float(lane_map, s))
     u = _inside(lane_map, row, u)
     return polynomial(_columns(lane_map.rows, row, range(12, 14)), u)
 
 
 def width(lane_map: LaneMap, lane: Index, s: Number) -> Float[Array, "*#b"]:
-    """Lane width, m; beyond the ends that of the end."""
+    """Lane width, m; beyond the ends of the lane that of the end."""
     row, u = _locate(lane_map, lane, _as_float(lane_map, s))
     return polynomial(_columns(lane_map.rows, row, range(8, 12)), _inside(lane_map, row, u))
 
 
 def elevation(lane_map: LaneMap, lane: Index, s: Number) -> tuple[Float[Array, "*#b"], Float[Array, "*#b"]]:
-    """Elevation z (m) and grade dz/ds of the centre line; beyond the ends those of the end."""
+    """Elevation z (m) and grade dz/ds of the centre line.
+
+    Beyond the ends of the lane they are those of the end.
+    """
     row, u = _locate(lane_map, lane, _as_float(lane_map, s))
     u = _inside(lane_map, row, u)
     cubic = _columns(lane_map.height, row, range(4))
@@ -161,7 +180,10 @@ def elevation(lane_map: LaneMap, lane: Index, s: Number) -> tuple[Float[Array, "
 
 
 def neighbor(lane_map: LaneMap, lane: Index, side: Index) -> tuple[Int[Array, "*#b"], Bool[Array, "*#b"]]:
-    """Lane on the left (`side` > 0) or right in the same direction, else NO_LANE; whether one may change."""
+    """The adjacent lane, and whether a vehicle may change to it.
+
+    It runs in the same direction; `side` > 0 is the left. It is NO_LANE where there is none.
+    """
     left = jnp.asarray(side) > 0
     return (
         jnp.where(left, lane_map.left[lane], lane_map.right[lane]),
@@ -170,9 +192,9 @@ def neighbor(lane_map: LaneMap, lane: Index, side: Index) -> tuple[Int[Array, "*
 
 
 def side_s(lane_map: LaneMap, lane: Index, s: Number, side: Index) -> Float[Array, "*#b"]:
-    """Arc length (m) on the left (`side` > 0) or right neighbour, level with `s` on `lane`.
+    """Arc length (m) on the adjacent lane, level with `s` on `lane`.
 
-    Where there is no neighbour, `s` itself.
+    `side` > 0 is the left. Without an adjacent lane the result is `s` itself.
     """
     row, u = _locate(lane_map, lane, _as_float(lane_map, s))
     start_l, slope_l, start_r, slope_r = _columns(lane_map.side, row, range(4))
@@ -181,21 +203,28 @@ def side_s(lane_map: LaneMap, lane: Index, s: Number, side: Index) -> Float[Arra
 
 
 def room_beside(lane_map: LaneMap, lane: Index, s: Number, side: Index) -> Float[Array, "*#b"]:
-    """m from `s` on `lane` to where its left (`side` > 0) or right neighbour no longer runs beside it."""
+    """Distance (m) from `s` on which the adjacent lane runs beside.
+
+    `side` > 0 is the left. Lanes that follow count while both continue side by side.
+    """
     beside = lane_map.beside_s[lane]
     return jnp.where(jnp.asarray(side) > 0, beside[..., 0], beside[..., 1]) - _as_float(lane_map, s)
 
 
 def turn_speed(lane_map: LaneMap, lane: Index, lateral_acceleration: Number) -> Float[Array, "*#b"]:
-    """Speed (m/s) at which the tightest bend takes this lateral acceleration (m/s^2), at most the limit.
+    """Speed (m/s) through the tightest bend, at most the speed limit.
 
-    SUMO limits junctions by 5.5 m/s^2; comfortable driving stays within 2 to 3 m/s^2.
+    SUMO limits junctions by a lateral acceleration of 5.5 m/s^2. Comfortable driving stays within 2 to
+    3 m/s^2.
     """
     return jnp.minimum(bend_speed(lane_map, lane, lateral_acceleration), lane_map.speed_limit[lane])
 
 
 def bend_speed(lane_map: LaneMap, lane: Index, lateral_acceleration: Number) -> Float[Array, "*#b"]:
-    """Speed (m/s) at which the tightest bend takes this lateral acceleration (m/s^2); 1e6 if straight."""
+    """Speed (m/s) at which the tightest bend takes this lateral acceleration (m/s^2).
+
+    It is 1e6 on straight lanes.
+    """
     bend = lane_map.curvature_max[lane]
     speed = safe_sqrt(safe_divide(_as_float(lane_map, lateral_acceleration), bend))
     return jnp.where(bend > 0, speed, 1e6)
@@ -208,15 +237,25 @@ def to_frenet(
     x: Number,
     y: Number,
 ) -> tuple[Float[Array, "*#b"], Float[Array, "*#b"], Float[Array, "*#b"]]:
-    """Arc length `s`, lateral offset `d` (m, left > 0) of a point, and the lane's heading there (rad).
+    """Project a point onto a known lane.
 
-    Finds the foot of the perpendicular nearest to `s_guess`, the last known arc length, by Newton steps
-    that may cross any number of intervals. A point before the start has `s < 0` and one past the end
-    `s > length`, measured along the end tangent: then it is the caller's turn to go on with a
-    predecessor (`s + its length`) or a successor (`s - length`).
+    Newton steps find the foot of the perpendicular nearest to `s_guess`; they may cross any number of
+    intervals. A point before the start has `s < 0` and one past the end `s > length`, measured along the
+    end tangent. The caller may then continue with a predecessor (`s + its length`) or a successor
+    (`s - length`).
 
-    Sound where `1 - kappa d > 0`, that is where the point is nearer than the centre of curvature.
+    The result is valid where `1 - kappa d > 0`: the point is nearer than the centre of curvature.
     Gradients are those of the exact projection (implicit function theorem); that of `s_guess` is zero.
+
+    Args:
+        lane_map: the map.
+        lane: row of the lane.
+        s_guess: the last known arc length, m.
+        x: map coordinates of the point, m.
+        y: the same.
+
+    Returns:
+        Arc length `s` (m), lateral offset `d` (m, left > 0), heading of the lane there (rad).
     """
     x, y = _as_float(lane_map, x), _as_float(lane_map, y)
     frozen, s, px, py = lax.stop_gradient((lane_map, _as_float(lane_map, s_guess), x, y))
@@ -238,14 +277,23 @@ def project(
     heading: Number | None = None,
     max_heading: float = math.pi / 2,
 ) -> tuple[Int[Array, "*#b"], Float[Array, "*#b"], Float[Array, "*#b"], Float[Array, "*#b"]]:
-    """Nearest lane of a point, and `s`, `d` (m) and the lane's heading (rad) there.
+    """Project a point onto the nearest lane.
 
-    Compares the feet of all perpendiculars on centre lines, and the ends of lanes, within `REACH`; with
-    `heading`, those where the lane's heading differs by less than `max_heading`. Of equal distances the
-    lower row wins. NO_LANE where there is none. A point beyond the centre of a bend sees two ends of it
-    and no foot between; with `heading`, only the nearer end is compared.
+    Candidates are the feet of all perpendiculars on centre lines, and the ends of lanes, within `REACH`.
+    Of equal distances the lower row wins. A point beyond the centre of a bend sees two ends of it and no
+    foot between; with `heading`, only the nearer end is a candidate.
 
     Meant for the start of a run: `to_frenet` is some hundred times faster.
+
+    Args:
+        lane_map: the map.
+        x: map coordinates of the point, m.
+        y: the same.
+        heading: direction of the vehicle, rad; without it, lanes of any direction are candidates.
+        max_heading: largest difference between `heading` and that of the lane, rad.
+
+    Returns:
+        Row of the lane (NO_LANE if there is none), `s` and `d` (m), heading of the lane there (rad).
     """
     x, y = _as_float(lane_map, x), _as_float(lane_map, y)
     frozen, px, py = lax.stop_gradient((lane_map, x, y))
@@ -260,7 +308,7 @@ def project(
         # Downhill from the nearer end: inside a bend the distance has its maximum between two ends.
         s = jnp.where(jnp.hypot(px - x0, py - y0) <= jnp.hypot(px - x1, py - y1), low, high)
         s = _search(frozen, lane, s, low, high, px, py, _GLOBAL_STEPS)
-        # An end of the stretch is no foot: go on to the foot, whose heading it is that has to fit.
+        # An end of the stretch is no foot: continue to the foot, whose heading has to fit.
         s = _search(frozen, lane, s, -jnp.inf, jnp.inf, px, py, _GLOBAL_STEPS)
         s = jnp.clip(s, 0, frozen.length[lane])
         foot = _curve(frozen, *_locate(frozen, lane, s))
@@ -283,13 +331,13 @@ def project(
 
 
 def absolute(lane_map: LaneMap, x: Any, y: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Map coordinates (m) in the coordinates of the file, on the host in float64."""
+    """Map to file coordinates (m), on the host in float64."""
     x0, y0 = np.asarray(lane_map.origin, np.float64)
     return np.asarray(x, np.float64) + x0, np.asarray(y, np.float64) + y0
 
 
 def relative(lane_map: LaneMap, x: Any, y: Any) -> tuple[Any, Any]:
-    """File coordinates (m) in the coordinates of the map, on the host: the inverse of `absolute`."""
+    """File to map coordinates (m), on the host: the inverse of `absolute`."""
     x0, y0 = np.asarray(lane_map.origin, np.float64)
     return np.float32(np.asarray(x, np.float64) - x0), np.float32(np.asarray(y, np.float64) - y0)
 
@@ -306,7 +354,7 @@ def _columns(table: Float[Array, "S W"], row: Int[Array, "*#b"], columns: Iterab
 def _locate(
     lane_map: LaneMap, lane: Index, s: Float[Array, "*#b"]
 ) -> tuple[Int[Array, "*#b"], Float[Array, "*#b"]]:
-    """Row of the interval that holds `s`, and arc length from its start, m."""
+    """Row of the interval at `s`, and distance from its start (m)."""
     ds = lane_map.ds[lane]
     index = jnp.clip(jnp.floor(s / ds).astype(jnp.int32), 0, lane_map.count[lane] - 1)
     return computed_once((lane_map.first[lane] + index, s - index.astype(s.dtype) * ds))
@@ -321,7 +369,7 @@ def _inside(lane_map: LaneMap, row: Int[Array, "*#b"], u: Float[Array, "*#b"]) -
 class _Curve(NamedTuple):
     """The centre line at a place: position relative to the start of its interval, and derivatives by s."""
 
-    x0: Any  # start of the interval, m; apart, so that differences to it stay exact in float32
+    x0: Any  # start of the interval, m; kept apart so that differences to it stay exact in float32
     y0: Any
     x: Any
     y: Any
@@ -384,7 +432,10 @@ def _search(
 
 
 def cell_row(ix: Any, iy: Any, size: int) -> Any:
-    """Row of a grid cell in the table of cells, of a NumPy or JAX cell; cells that collide share a row."""
+    """Row of a grid cell in a table of `size` rows; cells that collide share a row.
+
+    `ix` and `iy` count cells along x and y, as NumPy or JAX arrays of whole numbers.
+    """
     integer = np.int32 if isinstance(ix, np.ndarray) else jnp.int32
     unsigned = np.uint32 if isinstance(ix, np.ndarray) else jnp.uint32
     mixed = ix.astype(integer).astype(unsigned) * unsigned(73856093) ^ iy.astype(integer).astype(

@@ -1,4 +1,4 @@
-"""What a drawing of a map shows: outlines of lanes, storeys, kinds of surface, marks and stop bars.
+"""What a drawing of a map shows: outlines, surfaces, marks, stop bars.
 
 Pictures, videos and the interactive viewer stand on this module. It runs on the host in float64, in the
 coordinates of the file, and draws nothing itself.
@@ -126,13 +126,16 @@ class Outline:
         return np.concatenate([left, right[::-1]])
 
     def bar(self, s: float, share: float = 1.0) -> Array:
-        """A line `[2, 2]` across the lane at arc length `s` (m), over a share of its width."""
+        """A line `[2, 2]` across the lane at arc length `s` (m).
+
+        It covers a share of the width, in the middle.
+        """
         middle = self.at(s, self.centre)
         return middle + share * (np.stack([self.at(s, self.left), self.at(s, self.right)]) - middle)
 
 
 def outline(lane: Lane) -> Outline:
-    """The outline of one lane, with a sample at least every 3 degrees of a bend."""
+    """The outline of one lane, with samples at most 3 degrees apart."""
     # Samples are sparse where the cubic bends between them; a drawing is made of straight pieces.
     pieces = np.maximum(1, np.ceil(np.abs(np.diff(lane.heading)) / math.radians(3.0)).astype(int))
     start = np.repeat(np.arange(len(pieces)), pieces)
@@ -175,7 +178,7 @@ def surface(lane: Lane) -> str:
 
 
 def surface_rank(lane: Lane) -> tuple[bool, bool, bool]:
-    """Key that sorts the surfaces of one storey, those that are painted first in front."""
+    """Key that sorts the surfaces of one storey from the bottom up."""
     return lane.drivable, lane.junction is None, lane.type is not LaneType.NONE
 
 
@@ -226,7 +229,7 @@ class Mark(NamedTuple):
         return self.outline.right if self.side else self.outline.left
 
     def line(self, gap: float) -> Array:
-        """The line `[M, 2]`, `gap` (m) off the border if it is one of two."""
+        """The line `[M, 2]`; a line of a double mark is `gap` m off the border."""
         if not self.shift:
             return self.border
         heading = self.outline.heading
@@ -288,9 +291,9 @@ _HELD: dict[Held, frozenset[Control]] = {
 
 
 def held_ends(network: Network, marked: Collection[str]) -> list[tuple[str, Held]]:
-    """Ids of lanes whose traffic is held at their end, and by what.
+    """Ids of lanes that end at a control, and its kind.
 
-    Every movement out of such a lane has the same kind of control. Lanes in `marked` are left out.
+    Every movement out of such a lane has the same kind. Lanes in `marked` are left out.
     """
     controls: dict[str, set[Control]] = {}
     for movement in network.movements:
@@ -304,12 +307,13 @@ def held_ends(network: Network, marked: Collection[str]) -> list[tuple[str, Held
 
 
 def signal_bars(network: Network, lane_map: LaneMap) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Bars `[B, 2, 2]` (m) at stop lines, one for each lane behind that has a light.
+    """Bars at stop lines that show traffic lights.
 
-    Where a lane leads to several lanes with lights, they share its width from left to right.
+    There is one bar for each lane behind the stop line that has a light. Several of them share the width
+    of the lane from left to right.
 
     Returns:
-        The bars, and the row of the lane behind each `[B]`.
+        Bars `[B, 2, 2]` in file coordinates (m), and the row of the lane behind each `[B]`.
     """
     from limsim_jax.maps.lane_map import lane_rows
 
@@ -337,13 +341,16 @@ def signal_bars(network: Network, lane_map: LaneMap) -> tuple[NDArray[Any], NDAr
 
 
 def crosswalk_outline(crosswalk: Crosswalk) -> Array | None:
-    """Corners `[K, 2]` of a crosswalk (m), None if it has no area."""
+    """Corners `[K, 2]` (m) of a crosswalk; None without an area."""
     corners = np.asarray(crosswalk.outline, float)[:, :2]
     return corners if len(corners) >= 3 else None
 
 
 def crosswalk_stripes(network: Network, crosswalk: Crosswalk, pitch: float = 1.0) -> list[Array]:
-    """The bars of a crosswalk `[K, 2]` (m), along the traffic that crosses it, one every `pitch` m."""
+    """The stripes of a crosswalk, one every `pitch` m.
+
+    Each is a polygon `[K, 2]` (m) along the traffic that crosses the walk.
+    """
     corners = crosswalk_outline(crosswalk)
     if corners is None:
         return []

@@ -1,7 +1,7 @@
-"""A network to a `LaneMap`: lanes cut into intervals, and the tables of rules, padded to buckets.
+"""A network to a `LaneMap`: intervals of lanes and tables of rules.
 
 Runs on the host in float64; `limsim_jax.maps.lane_map` says what the intervals are. A lane gets the longest
-intervals whose deviation from the lane of the network stays within `TOLERANCE`.
+intervals that stay within `TOLERANCE` of the lane of the network. All tables are padded to `bucket` sizes.
 """
 
 from __future__ import annotations
@@ -44,18 +44,18 @@ TOLERANCE = {"position": 1e-3, "width": 1e-3, "elevation": 1e-2, "heading": math
 """Largest deviation of a device lane from its host lane, m and rad, unless `ds` is already the least."""
 
 WORST_DEVIATION = 0.05
-"""A map with a lane that deviates by more, at the least `ds`, is refused, m."""
+"""A map with a lane that deviates by more at the least `ds` is refused, m."""
 
 TURN_WINDOW = 4.0
 """`curvature_max` is the mean over a stretch of this length, m: about a wheelbase and a half."""
 
 MIN_WIDTH = 2.7
-"""m, of a lane on which any vehicle finds room: a bus is 2.55 m wide."""
+"""Least width of a lane for all vehicles, m: a bus is 2.55 m wide."""
 
 SIGHT = 50.0
-"""m that everybody has to see along its way: what it takes to stop from 70 km/h with 4 m/s^2."""
+"""Distance that every vehicle must see ahead, m: to stop from 70 km/h with 4 m/s^2."""
 
-_MOST = 12  # lanes that anybody looks over
+_MOST = 12  # lanes that a vehicle scans, at most
 _BESIDE = 500.0  # m, beyond which it does not matter how far lanes run side by side
 _CHUNK_LENGTH, _CHUNK_TURN = 32.0, 0.6  # m, rad: a candidate of `project` has at most about one closest point
 _JUMP = 1.5e-3  # m: closer host samples are a kink or a step
@@ -83,13 +83,13 @@ _LEAST = {  # least sizes of tables, so that all small maps have the same shapes
 def build_lane_map(
     network: Network, goals: Goals | None = None, *, report: ImportReport | None = None
 ) -> LaneMap:
-    """Rasterise the lanes of a network for the device, with its conflict, routing and signal tables.
+    """Turn a network into arrays: lanes, conflicts, routes and signals.
 
     Args:
         network: the map.
         goals: lane ids of each goal of `routes`, in the order of its columns or by name; default: the
             ways out of the map, see `routing.default_goals`.
-        report: takes a note for every lane that misses `TOLERANCE` at the least interval length.
+        report: receives a note for every lane that misses `TOLERANCE` at the least interval length.
 
     Raises:
         MapError: no lane for motor traffic, numbers that are not finite, a link to a lane that is not
@@ -148,9 +148,10 @@ def build_lane_map(
 
 
 def _without_side_steps(network: Network, report: ImportReport | None) -> Network:
-    """The network without links by which a vehicle would leap sideways, where a lane beside goes on instead.
+    """The network without links by which a vehicle would leap sideways.
 
-    Some files let two lanes go on as one where one of them ends beside it. Who is on that one changes lanes.
+    In some files two lanes continue as one where one of them ends beside it. Without the link from that one,
+    its vehicles change lanes.
     """
     lanes = dict(network.lanes)
     for lane in network.drivable_lanes():
@@ -174,7 +175,7 @@ def _without_side_steps(network: Network, report: ImportReport | None) -> Networ
 
 
 def _side_step(before: Lane, after: Lane) -> float:
-    """m across the track from the end of a lane to the start of the next."""
+    """Lateral distance (m) from the end of a lane to the next."""
     off = after.xyz[0, :2] - before.xyz[-1, :2]
     heading = before.heading[-1]
     return abs(float(off[1] * np.cos(heading) - off[0] * np.sin(heading)))
@@ -219,7 +220,7 @@ def _device_type(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _inert(table: NDArray[Any]) -> Any:
-    """What the null lane has in a table of lanes: False, NO_LANE, no curvature."""
+    """Value of the null lane in a table of lanes: False, NO_LANE or zero."""
     return {"b": False, "i": NO_LANE, "f": 0.0}[table.dtype.kind]
 
 
@@ -231,7 +232,7 @@ def _pad(table: NDArray[Any], size: int, value: Any) -> NDArray[Any]:
 
 
 def _lane_tables(network: Network, lanes: list[Lane]) -> dict[str, NDArray[Any]]:
-    """What the network says about each lane, as arrays by row."""
+    """Attributes and links of each lane, as arrays by row."""
     rows = {lane.id: row for row, lane in enumerate(lanes)}
     junctions = {junction: index for index, junction in enumerate(network.junctions)}
     stop_s = np.array([lane.length for lane in lanes])
@@ -285,9 +286,11 @@ def _lane_tables(network: Network, lanes: list[Lane]) -> dict[str, NDArray[Any]]
 
 
 def _beside(lanes: list[Lane], rows: Mapping[str, int], side: Literal["left", "right"]) -> Floats:
-    """m from the start of each lane to where its neighbour parts from it or a junction begins.
+    """Distance (m) on which the neighbour of each lane runs beside it.
 
-    Where lanes fork, the way on which that comes first counts; after this lane `_BESIDE` m are enough.
+    It is measured from the start of the lane to where the neighbour parts from it. A junction parts lanes,
+    too. Where lanes fork, the branch on which they part first counts. Beyond this lane at most `_BESIDE` m
+    count.
     """
 
     def goes_on(lane: Lane, after: str) -> bool:
@@ -315,8 +318,11 @@ def _beside(lanes: list[Lane], rows: Mapping[str, int], side: Literal["left", "r
 
 
 def _lanes_in_sight(lanes: list[Lane], rows: Mapping[str, int]) -> int:
-    """Most lanes beyond its own one that a vehicle looks over to see `SIGHT` m ahead; at most `_MOST`."""
-    reach = np.zeros(len(lanes))  # m that the shortest way over so many lanes has
+    """Lanes beyond its own in `SIGHT` of a vehicle.
+
+    The largest number for any lane, at most `_MOST`.
+    """
+    reach = np.zeros(len(lanes))  # m, length of the shortest way over this many lanes
     for count in range(_MOST):
         after = [[reach[rows[x]] for x in lane.successors if x in rows] for lane in lanes]
         if min((min(ways) for ways in after if ways), default=SIGHT) >= SIGHT:
@@ -328,7 +334,10 @@ def _lanes_in_sight(lanes: list[Lane], rows: Mapping[str, int]) -> int:
 
 
 def _wide_until(lane: Lane) -> float:
-    """m from the start to where a lane without successors becomes too narrow; its length if it does not."""
+    """Where a lane without successors becomes too narrow, m from its start.
+
+    For all other lanes it is their length.
+    """
     wide = np.nonzero(lane.width >= MIN_WIDTH)[0]
     if lane.successors or not len(wide) or wide[-1] == len(lane.width) - 1:
         return lane.length
@@ -337,7 +346,10 @@ def _wide_until(lane: Lane) -> float:
 
 @dataclass(frozen=True)
 class _HostLanes:
-    """Samples of all lanes end to end on one axis, so that one search serves many lanes."""
+    """Samples of all lanes end to end on one axis.
+
+    One search on that axis serves many lanes.
+    """
 
     lanes: list[Lane]
     offset: Float[NDArray[np.float64], " L"]  # where each lane starts on the axis
@@ -393,7 +405,10 @@ class _HostLanes:
         )
 
     def at(self, lane: NDArray[np.int64], s: NDArray[np.float64], toward: float = 0.0) -> _Samples:
-        """All quantities at `s` on `lane`; at a kink or step those on its far (+1) or near (-1) side."""
+        """All quantities at `s` (m) on `lane`.
+
+        At a kink or step they are those on its far (`toward` = +1) or near (-1) side.
+        """
         t = self.offset[lane] + s
         last = np.append(self.first[1:], len(self.t))[lane] - 2
         j = np.clip(np.searchsorted(self.t, t + 1e-7 * toward, side="right") - 1, self.first[lane], last)
@@ -433,11 +448,11 @@ class _HostLanes:
 def _one_sided_curvature(
     s: NDArray[np.float64], heading: NDArray[np.float64], curvature: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Curvature where the stretch from each sample to the next starts and ends.
+    """Curvature at both ends of each stretch between samples.
 
-    A sample where the curvature jumps has one value, right for one of its sides. The turn along the stretch
-    tells when that is the other side; then the value that is nearer to the mean curvature holds, and the
-    other follows from the mean.
+    A sample where the curvature jumps has one value, valid on one of its sides. The turn along the stretch
+    shows when that is the other side. The value nearer to the mean curvature then holds, and the other
+    follows from the mean.
     """
     pairs = np.stack([curvature, np.append(curvature[1:], curvature[-1])], -1)
     h = np.append(np.diff(s), 0.0)
@@ -474,7 +489,7 @@ class _Raster:
 
 
 def _rasterise(network: Network, host: _HostLanes, report: ImportReport | None) -> _Raster:
-    """Intervals of all lanes, for each at the longest spacing that keeps it within `TOLERANCE`."""
+    """Intervals of all lanes, each at the longest spacing within `TOLERANCE`."""
     check = _check_points(host)
     everything = todo = np.arange(len(host.lanes))
     ds = np.full(len(host.lanes), SPACINGS[-1])
@@ -532,7 +547,7 @@ def _cut(host: _HostLanes, lanes: NDArray[np.int64], ds: NDArray[np.float64]) ->
 
 
 def _cubic_through(h: NDArray[np.float64], *values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients in u of the cubic with these four values at u = 0, h/3, 2h/3, h."""
+    """Coefficients of cubics with these values at 0, h/3, 2h/3, h."""
     nodes = np.linalg.inv(np.vander(np.arange(4) / 3, increasing=True))
     return np.stack(values, -1) @ nodes.T / h[:, None] ** np.arange(4)
 
@@ -547,7 +562,9 @@ class _Check(NamedTuple):
 
 
 def _check_points(host: _HostLanes) -> _Check:
-    """Host samples, places between them at most 0.25 m apart, and more around kinks and steps.
+    """Host samples, and places between them at most 0.25 m apart.
+
+    Around kinks and steps there are more.
 
     The number of parts is odd: halves and quarters of host intervals tend to be bounds of ours.
     """
@@ -603,9 +620,10 @@ def _deviation(
 
 
 def _curvature_max(host: _HostLanes) -> NDArray[np.float64]:
-    """Largest |turn| per metre of each lane over any stretch of `TURN_WINDOW`, or the lane if it is shorter.
+    """Largest mean |curvature| of each lane over any stretch of `TURN_WINDOW`, 1/m.
 
-    A mean, because a polyline bends nowhere but at its kinks. Stretches below 1 m count as 1 m.
+    A shorter lane is one stretch; stretches below 1 m count as 1 m. It is a mean because a polyline bends
+    nowhere but at its kinks.
     """
     stretch = np.minimum(TURN_WINDOW, host.length)[host.lane]
     begin, end = host.offset[host.lane], (host.offset + host.length)[host.lane]
@@ -618,7 +636,7 @@ def _curvature_max(host: _HostLanes) -> NDArray[np.float64]:
 
 
 def _grid(raster: _Raster, rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
-    """Tables of `project`: short stretches of lane, and for each cell those within `REACH` of it."""
+    """Tables of `project`: short stretches of lane, and those near each cell."""
     c, h = rows.T, rows[:, 14]
     turn = np.arctan2(polynomial(derivative(c[4:8]), h), polynomial(derivative(c[:4]), h)) - np.arctan2(
         c[5], c[1]

@@ -1,7 +1,7 @@
-"""Routes as tables: for every lane and goal, which lane comes next and which lane to be in by when.
+"""Routes as tables: the way from every lane to every goal.
 
-A vehicle carries one number, its goal; where it stands, the tables say how far it is, which
-successor to take, how many lanes to cross and by where. Built on the host in float64 with Dijkstra's
+A vehicle carries one number, its goal. For its lane the tables say how far the goal is, which successor to
+take, how many lanes to cross, and where at the latest. They are built on the host in float64 by Dijkstra's
 algorithm on the reversed lane graph, from all goals at once.
 """
 
@@ -30,12 +30,14 @@ CHANGE_PENALTY = 30.0
 """Metres of detour that are preferred to one lane change."""
 
 ROOM_TO_CHANGE, SHORT_PENALTY = 30.0, 300.0
-"""m: a lane shorter than the first is a bad place to change lanes; to changing on one of no length at all, a
-detour of the second is preferred."""
+"""m: on a lane shorter than the first, a change costs more, up to a detour of the second at no length."""
 
 NO_ROOM, NO_WAY = 10.0, 1e5
-"""m: on lanes shorter than the first nobody counts on a change; a detour of the second is preferred, and who
-must change before such a lane does not drive on to it."""
+"""m: a lane shorter than the first is no place to change lanes.
+
+A detour of the second is preferred to such a change. A vehicle that must change before such a lane does not
+drive on to it.
+"""
 
 TOLERANCE = 5.0
 """Metres by which lanes that lead to the same place may differ in length and still be equally good."""
@@ -77,9 +79,9 @@ class RouteTable:
     is_goal: Bool[Array, "L G"]
 
     def pad(self, *, lanes: int, goals: int) -> RouteTable:
-        """The same table with this many rows (null rows included) and goals; new goals are unreachable.
+        """The same table with more rows and goals; new goals are unreachable.
 
-        Raises `ValueError` if the table does not fit.
+        `lanes` counts the null rows, too. Raises `ValueError` if the table does not fit.
         """
         rows, columns = self.distance.shape
         if lanes < rows or goals < columns:
@@ -100,11 +102,12 @@ class RouteTable:
 def default_goals(network: Network) -> dict[str, tuple[str, ...]]:
     """The ways out of a map: groups of lane ids by name.
 
-    One goal per road and direction on which traffic leaves the map: the last lanes, none of which has
-    a drivable successor. A map without exits (closed loops) has one goal per road and direction outside
-    junctions instead: the last lanes on it. A lane that ends beside one that goes on is neither.
-    Names are road ids, with `+` or `-` for the sign of the lane numbers where a road has traffic both
-    ways (OpenDRIVE).
+    There is one goal per road and direction on which traffic leaves the map: the last lanes, none of which
+    has a drivable successor. A map without exits (closed loops) has one goal per road and direction outside
+    junctions: the last lanes on it. A lane that ends beside one that continues is no goal.
+
+    Names are road ids. Where a road has traffic both ways, `+` or `-` follows, the sign of its lane numbers
+    (OpenDRIVE).
     """
     lanes = {lane.id: lane for lane in network.drivable_lanes()}
     go_on = {lane.carriageway for lane in lanes.values() if any(name in lanes for name in lane.successors)}
@@ -145,9 +148,9 @@ def build_routes(
             `default_goals`.
         vehicle_class: Use only lanes that this class may use. Default: all drivable lanes.
         change_penalty: Cost of one lane change, m.
-        short_penalty: What is added on a lane of no length; on one of `ROOM_TO_CHANGE` nothing. 0: short
-            lanes, below `NO_ROOM` as well, are as good as others.
-        tolerance: Prefer staying in the lane if it is at most this much longer, m.
+        short_penalty: Cost (m) that is added for a change on a lane of no length. It falls to nothing at
+            `ROOM_TO_CHANGE`. With 0 short lanes are as good as others, also below `NO_ROOM`.
+        tolerance: Prefer the own lane if its way is at most this much longer, m.
 
     Raises:
         MapError: a goal without lanes, or with one that is not a drivable lane of the map.
@@ -201,8 +204,9 @@ def build_fixed_routes(
 
 
 def split_route(roads: Sequence[str]) -> list[tuple[str, ...]]:
-    """Cut a list of roads into legs without repetition; each begins with the last road of the one before.
+    """Cut a list of roads into legs that visit no road twice.
 
+    Each leg begins with the last road of the one before:
     `["a", "b", "a", "c"]` becomes `[("a", "b"), ("b", "a", "c")]`.
     """
     legs: list[list[str]] = [[]]
@@ -211,48 +215,6 @@ def split_route(roads: Sequence[str]) -> list[tuple[str, ...]]:
             legs.append([legs[-1][-1]])
         legs[-1].append(road)
     return [tuple(leg) for leg in legs]
-
-
-def route_lanes(
-    network: Network, roads: Sequence[str], *, vehicle_class: str | None = None
-) -> tuple[tuple[str, ...], ...]:
-    """For every road of a route, the ids of its last lanes from which the rest of the route can be driven.
-
-    Lane changes are allowed where the map allows them, on any road of the route. On the last road all
-    lanes qualify. Raises `MapError` as `build_fixed_routes` does; roads may come twice.
-    """
-    found: list[tuple[str, ...]] = []
-    lanes = list(network.drivable_lanes())
-    rows = {lane.id: i for i, lane in enumerate(lanes)}
-    graph = _LaneGraph(network, rows, vehicle_class)
-    _checked_route(network, roads, vehicle_class, repeats=True)
-    wanted = [lane.id for lane in graph.ends(roads[-1])]
-    found.append(tuple(wanted))
-    for road, after in reversed(list(itertools.pairwise(roads))):
-        table = graph.solve([[rows[name] for name in wanted]], 1.0, 0.0, graph.along((road, after)))
-        leads_on = [x for x in graph.ends(road) if table.next_lane[rows[x.id], 0] >= 0]
-        if not leads_on:
-            raise _dead_end(network, road, after, roads[-1])
-        wanted = [lane.id for lane in leads_on]
-        found.append(tuple(wanted))
-    return tuple(reversed(found))
-
-
-def require_reachable(network: Network, table: RouteTable, start: str, goal: int) -> None:
-    """Raise a `MapError` that names both ends unless goal number `goal` can be reached from lane `start`."""
-    lanes = list(network.drivable_lanes())
-    row = next((i for i, lane in enumerate(lanes) if lane.id == start), None)
-    if row is None:
-        raise MapError(_no_such_lane(network, start), file=network.source)
-    if not 0 <= goal < table.distance.shape[1]:
-        raise MapError(f"no goal {goal}; there are {table.distance.shape[1]}", file=network.source)
-    if not table.reachable[row, goal]:
-        ends = [lane for i, lane in enumerate(lanes) if table.is_goal[i, goal]]
-        roads = ", ".join(dict.fromkeys(f"'{lane.road}'" for lane in ends)) or "nowhere"
-        raise MapError(
-            f"no way from lane '{start}' (road '{lanes[row].road}') to goal {goal} (road {roads})",
-            file=network.source,
-        )
 
 
 def _dead_end(network: Network, road: str, after: str, last: str) -> MapError:
@@ -268,16 +230,19 @@ def _no_such_lane(network: Network, name: str) -> str:
 def _checked_route(
     network: Network, roads: Sequence[str], vehicle_class: str | None, *, repeats: bool = False
 ) -> tuple[str, ...]:
-    """The route, if every road is there, has a lane to drive on, and comes once."""
+    """The route as a tuple. Raises `MapError` if it cannot be driven.
+
+    Every road must exist and have a lane for this class. No road may come twice unless `repeats`.
+    """
     if not roads:
         raise MapError("a route needs at least one road", file=network.source)
     usable = {lane.road for lane in network.drivable_lanes() if _may_use(lane, vehicle_class)}
     for road in roads:
         if road not in usable:
             network.road_lanes(road)  # raises if there is none of this name
-            who = vehicle_class or "motor traffic"
-            raise MapError(f"no lane of road '{road}' is for {who}", file=network.source)
-    if not repeats and len(set(roads)) < len(roads):
+            traffic = vehicle_class or "motor traffic"
+            raise MapError(f"no lane of road '{road}' is for {traffic}", file=network.source)
+    if len(set(roads)) < len(roads):
         twice = next(road for road in roads if list(roads).count(road) > 1)
         raise MapError(f"the route visits road '{twice}' twice; cut it with split_route", file=network.source)
     return tuple(roads)
@@ -301,11 +266,11 @@ class _LaneGraph:
             return np.array(found, int).reshape(-1, 2)
 
         self.ahead = links([(lane.id, name) for lane in self.lanes for name in lane.successors])
-        # nobody changes lanes within a junction, see `traffic.lane_change.place_beside`
+        # vehicles do not change lanes within a junction, see `traffic.lane_change.place_beside`
         outside = [lane for lane in self.lanes if lane.junction is None]
         self.left = links([(lane.id, lane.left) for lane in outside if lane.may_change_left])
         self.right = links([(lane.id, lane.right) for lane in outside if lane.may_change_right])
-        # Lanes side by side count with their mean length: else a route would change lanes at every
+        # Lanes side by side count with their mean length. Otherwise a route would change lanes at every
         # bend to save some metres, and long before it must.
         beside = links([(lane.id, name) for lane in self.lanes for name in (lane.left, lane.right)])
         size = len(self.lanes)
@@ -314,7 +279,7 @@ class _LaneGraph:
         self.cost = (np.bincount(group, self.length) / np.maximum(np.bincount(group), 1))[group]
 
     def ends(self, road: str) -> list[Lane]:
-        """Lanes of a road from which no lane of the same road follows."""
+        """Lanes of a road with no successor on the same road."""
         return [
             lane
             for lane in self.lanes
@@ -395,8 +360,8 @@ class _LaneGraph:
         own = self.cost[:, None]
         straight = np.where(is_goal, own, own + behind)
         next_lane[straight > cost + NO_WAY / 2] = -1
-        # A lane is stayed in where that costs (almost) nothing; half of its length at most, so that
-        # the cost to go falls along the way.
+        # A vehicle stays in a lane where that costs almost nothing, half of the length of the lane at
+        # most, so that the cost to go falls along the way.
         stays = straight <= cost + np.minimum(tolerance, 0.5 * own) + 1e-6
         cost_left, to_left = best(self.left)
         cost_right, to_right = best(self.right)
@@ -404,7 +369,7 @@ class _LaneGraph:
         changes_left = reachable & ~stays & (cost_left < cost_right)
         changes_right = reachable & ~stays & ~changes_left
 
-        # Go straight on, in jumps that double, to the lane where a change is due.
+        # Follow the successors, in jumps that double, to the lane where a change is due.
         itself = np.broadcast_to(np.arange(size)[:, None], (size, count))
         moves = reachable & stays & ~is_goal
         at = np.where(moves, next_lane, itself)
@@ -448,7 +413,7 @@ def _matrix(links: NDArray[np.int_], costs: Floats, size: int) -> csr_array:
 
 
 def _nth_of_each(pairs: NDArray[np.int_], n: int) -> NDArray[np.int_]:
-    """The n-th link of every lane that has so many."""
+    """The n-th link of every lane that has more than n."""
     order = np.argsort(pairs[:, 0], kind="stable")
     pairs = pairs[order]
     first = np.searchsorted(pairs[:, 0], pairs[:, 0])
@@ -458,7 +423,10 @@ def _nth_of_each(pairs: NDArray[np.int_], n: int) -> NDArray[np.int_]:
 def _closure(
     start: NDArray[np.bool_], tail: NDArray[np.int_], head: NDArray[np.int_], within: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Nodes of `within` that are reached from `start` by links tail -> head over nodes of `within`."""
+    """Nodes that are reached from `start` by links tail -> head.
+
+    Only nodes of `within` count, as stops and on the way.
+    """
     reached = start.copy()
     while True:
         more = np.zeros_like(reached)

@@ -81,7 +81,7 @@ def test_bridges_do_not_conflict():
     assert entries(crossing(math.pi / 2, z=3.4))
 
 
-def test_ramp_conflicts_only_where_it_is_level():
+def test_a_ramp_conflicts_only_at_its_foot():
     """A lane that climbs over another conflicts at its foot and not where it passes over."""
     s = np.linspace(0, 200, 801)
     z = np.clip((s - 40) * 0.1, 0, 6)
@@ -167,7 +167,7 @@ def test_oncoming_lanes_and_other_sections_of_one_road_are_apart():
 
 
 def sweeps(net):
-    """(lane, foe) -> 1/m^2 of the lane and of the foe, where only the ends of bodies meet."""
+    """(lane, foe) -> `sweep` and `f_sweep` (1/m^2), where only the ends of bodies meet."""
     table, ids = build_conflicts(net, rows(net)), list(rows(net))
     return {
         (ids[table.lane[k]], ids[table.lane[table.foe[k, c]]]): (table.sweep[k, c], table.f_sweep[k, c])
@@ -193,7 +193,7 @@ def test_ends_of_long_bodies_meet_where_turns_pass_back_to_back():
         assert 0 < table.s_in[k, c] < table.length[k] / 2 < table.s_out[k, c] < table.length[k]
 
 
-def test_of_turns_side_by_side_only_the_inner_one_sweeps():
+def test_only_the_inner_of_two_parallel_turns_sweeps():
     inner, outer = (arc(name, (0, 0), r, 0.0, 1.5, junction="J") for name, r in (("in", 7.0), ("out", 10.0)))
     sweep, f_sweep = sweeps(network([inner, outer]))["in", "out"]
     assert sweep == pytest.approx(1 / (8 * 7.0 * (3.0 - VEHICLE_WIDTH)), rel=0.02) and f_sweep == 0
@@ -201,7 +201,7 @@ def test_of_turns_side_by_side_only_the_inner_one_sweeps():
     assert not sweeps(network(ahead))
 
 
-def test_a_lane_does_not_conflict_with_what_follows_it():
+def test_a_lane_does_not_conflict_with_its_successors():
     a = straight("a", (0, 0), 0.0, 20.0, junction="J", successors=("b",))
     b = straight("b", (20, 0), 0.0, 1.0, junction="J", successors=("c",))
     c = straight("c", (21, 0), 0.0, 20.0, junction="J")
@@ -230,7 +230,7 @@ def test_lanes_outside_junctions_that_merge():
     assert table.connector[rows(net)["after"]] == -1
 
 
-def test_lanes_outside_junctions_that_part():
+def test_lanes_outside_junctions_that_diverge():
     before = straight("before", (0, 0), 0.0, 50.0, successors=("on", "off"))
     on = straight("on", (50, 0), 0.0, 900.0)
     off = curve("off", (50, 0), 0.0, (130, -30), -0.6)
@@ -240,7 +240,7 @@ def test_lanes_outside_junctions_that_part():
 
 
 def test_kinds_carry_over_along_a_movement_of_several_lanes():
-    """A left turn cut in two inside the area in which it parts from the straight way."""
+    """A left turn cut in two inside the area in which it diverges from the straight path."""
     through = straight("through", (0, 0), 0.0, 40.0, road="t", junction="J", successors=("out",))
     turn = arc("turn", (0, 14), 14.0, -math.pi / 2, math.pi / 2, junction="J")
     for cut in (3.0, 7.0):
@@ -261,8 +261,8 @@ def test_kinds_carry_over_along_a_movement_of_several_lanes():
         assert later["s_in"] == pytest.approx(14 * math.sin(cut / 14), abs=0.05)
 
 
-def test_two_ways_that_join_end_level_whatever_lanes_they_consist_of():
-    """A right turn cut in two inside the area in which it joins the straight way."""
+def test_merging_paths_end_level_however_they_are_cut_into_lanes():
+    """A right turn cut in two inside the area in which it merges with the straight path."""
     through = straight("through", (0, 0), 0.0, 40.0, junction="J", successors=("out",))
     turn = arc("turn", (40.0, -14.0), 14.0, math.pi, -math.pi / 2, junction="J")
     after = straight("out", (40, 0), 0.0, 50.0)
@@ -280,7 +280,7 @@ def test_two_ways_that_join_end_level_whatever_lanes_they_consist_of():
 
 
 def test_lanes_that_lead_to_the_same_lane_merge_however_far_apart_they_end():
-    """A lane that ends beside another one and goes on as it: vehicles step aside there."""
+    """A lane ends beside another one and continues as that one: vehicles step aside there."""
     lanes = [
         straight("a", (0, 0), 0.0, 30.0, junction="J", successors=("out",)),
         straight("b", (24, 3.5), 0.0, 6.0, junction="J", successors=("out",)),
@@ -295,7 +295,7 @@ def test_lanes_that_lead_to_the_same_lane_merge_however_far_apart_they_end():
 
 
 def yields(net, **options):
-    """Pairs (lane, foe) in which the lane lets the foe go first."""
+    """Pairs (lane, foe) in which the lane yields to the foe."""
     return {pair for pair, found in entries(net, **options).items() if any(e["prio"] < 0 for e in found)}
 
 
@@ -369,7 +369,7 @@ def test_file_decides_before_everything():
 
 
 def test_right_before_left_at_a_tee_and_its_mirror_image():
-    """Two straight ways that cross at a right angle; the one from the right goes first."""
+    """Two straight paths cross at a right angle; the one from the right goes first."""
 
     def net(left_hand):
         a = straight("from_south", (0, -20), math.pi / 2, 40, junction="J")
@@ -397,7 +397,7 @@ def test_circulating_traffic_goes_first():
     table = build_conflicts(net, rows(net))
     for a in range(4):
         assert (f"{a}:enter", f"{a}:on") in yields(net)
-        assert table.clear_s[table.connector[rows(net)[f"{a}:leave"]]] == 0  # parts, but meets nobody
+        assert table.clear_s[table.connector[rows(net)[f"{a}:leave"]]] == 0  # parts, but meets no vehicle
     # Without the ring, the rule of turns alone would decide; make the entry straight to see the ring win.
     straightened = tuple(
         dataclasses.replace(m, turn=Turn.STRAIGHT if ":enter" in m.via[0] else Turn.RIGHT)
@@ -458,7 +458,7 @@ def test_zipper_and_all_way_stop_are_equal(control):
     assert any(e["tie"] for e in found) == (control is Control.ALL_WAY_STOP)
 
 
-def test_circles_are_broken_or_reported():
+def test_cycles_are_broken_or_reported():
     net = intersection()
     table = build_conflicts(net, rows(net))
     assert priority_cycles(table) == []
@@ -475,7 +475,7 @@ def test_circles_are_broken_or_reported():
     assert straight_on["tie"] == only(net, "in0_0>out2_0", "in1_0>out3_0", break_cycles=False)["prio"] != 0
 
 
-def test_circles_in_the_file_stay():
+def test_cycles_in_the_file_stay():
     net = intersection()
     names = ["in0_0>out2_0", "in1_0>out3_0", "in2_0>out0_0", "in3_0>out1_0"]
     by_via = {m.via[0]: m for m in net.movements}
@@ -508,7 +508,7 @@ def test_waiting_point_of_a_left_turn():
 
 @pytest.mark.parametrize("cut", [5.0, 12.0])
 def test_waiting_point_of_a_movement_of_two_lanes(cut):
-    """On the second lane the point is that much nearer; past it there is none."""
+    """On the second lane the point is nearer by the first; past it there is none."""
     net = intersection(radius=22.0)
     name = "in0_0>out3_0"
     whole = net.lanes[name]
@@ -571,7 +571,7 @@ def test_shapes_order_and_padding():
         table.pad(lanes=len(row) + 1, connectors=num - 1, foes=slots)
 
 
-def test_stop_signs_are_known_at_the_first_connector():
+def test_the_first_connector_knows_its_stop_sign():
     net = intersection(lanes=1)
     movements = tuple(
         dataclasses.replace(m, control=Control.STOP) if m.index == 2 else m for m in net.movements

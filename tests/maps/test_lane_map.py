@@ -189,7 +189,7 @@ def test_clothoid_against_fresnel_integrals():
 
 
 @pytest.mark.parametrize("reverse", [False, True])
-def test_curvature_jumps_where_the_lane_does_though_a_sample_has_one_value(reverse):
+def test_curvature_jumps_at_a_sample_with_one_value(reverse):
     line = Line((40.0, 0.02, 0.02), (40.0, 0.0, 0.0), (40.0, -0.01, -0.01), step=8.0)
     lane = line.lane("a", reverse=reverse)
     lane_map = build_lane_map(network(lane))
@@ -334,7 +334,7 @@ def test_turn_speed(device, rows):
     np.testing.assert_allclose(lm.turn_speed(straight, 0, 3.0), 13.9)
 
 
-def test_more_links_than_usual_fit():
+def test_a_lane_may_have_many_successors():
     line = Line((20.0, 0.0, 0.0))
     many = [line.lane(f"b{k}", number=k) for k in range(7)]
     fork = line.lane("fork", road="2", successors=tuple(lane.id for lane in many))
@@ -346,7 +346,7 @@ def test_more_links_than_usual_fit():
 
 
 def long_network(single):
-    """10 km from end to end, with bends, as one lane or as 40 of them; left and right edges by width 7 m."""
+    """10 km with bends, as one lane or as 40; the lanes are 7 m wide."""
     bends = [(40.0, 0.0, 1 / 60), (40.0, 1 / 60, 0.0), (40.0, 0.0, -1 / 60), (40.0, -1 / 60, 0.0)]
     block = [(90.0, 0.0, 0.0), *bends]
     if single:
@@ -497,7 +497,7 @@ def test_gradients_equal_finite_differences(host, name):
 
 
 def test_gradients_are_finite_everywhere(device, rows):
-    """On interval bounds, ends, kinks, the null lane and at the centre of curvature; in float32."""
+    """On interval bounds, ends, kinks, the null lane and at the centre of curvature, in float32."""
 
     tables = {name: getattr(device, name) for name in ("rows", "height", "side", "ds", "curvature_max")}
 
@@ -520,7 +520,7 @@ def test_gradients_are_finite_everywhere(device, rows):
 
 
 def test_gradients_are_finite_where_a_lane_turns_on_the_spot(device):
-    """There the tangent vanishes: rows that stand still stand in for it."""
+    """The tangent vanishes there; rows of constant position imitate that."""
     still = dataclasses.replace(device, rows=device.rows.at[:, 1:4].set(0).at[:, 5:8].set(0))
 
     def total(rows, s, d):
@@ -532,7 +532,7 @@ def test_gradients_are_finite_where_a_lane_turns_on_the_spot(device):
 
 
 def test_gradients_on_interval_bounds_are_those_of_one_side():
-    """Not half of them, as a clip has on its bounds."""
+    """A clip would halve them on its bounds."""
     radius = 50.0
     lane_map = build_lane_map(network(Line((40.0, 1 / radius, 1 / radius)).lane("a")))
     bounds = jnp.arange(0, 40, float(lane_map.ds[0]))

@@ -216,7 +216,7 @@ def test_every_lane_is_drawn_with_its_surface(crossing):
     np.testing.assert_allclose(drawn, exact, rtol=2e-3)
 
 
-def test_arrows_point_along_the_lane_they_stand_on(crossing):
+def test_arrows_point_along_their_lane(crossing):
     arrows = _polygons(draw_network(_axes(), crossing)["arrows"])
     seen = set()
     for arrow in arrows:
@@ -239,8 +239,8 @@ def test_arrows_point_along_the_lane_they_stand_on(crossing):
 @pytest.mark.parametrize(
     ("arm", "painted"),
     [
-        ("W", [(3.5, 1.0)]),  # nobody may cross
-        ("N", [(3.5, 0.5)]),  # both may
+        ("W", [(3.5, 1.0)]),  # no vehicle may cross
+        ("N", [(3.5, 0.5)]),  # both lanes may
         ("E", [(3.5 - 0.12, 1.0), (3.5 + 0.12, 0.5)]),  # only from the outer lane: dashed on its side
     ],
 )
@@ -260,7 +260,7 @@ def test_marks_between_lanes_follow_the_permissions(crossing, arm, painted):
         assert length[d] / (REACH - BOX) == pytest.approx(share, abs=0.07)
 
 
-def test_opposite_directions_are_parted_by_one_centre_line(crossing):
+def test_one_centre_line_separates_opposite_directions(crossing):
     marks = draw_network(_axes(), crossing)["marks"]
     assert sum(len(lines) for color, lines in _lines(marks) if color == CENTRE) == 4
 
@@ -510,7 +510,7 @@ def test_a_target_that_cannot_be_written_is_one_clear_line(crossing, tmp_path, n
 
 
 @pytest.mark.parametrize("bounds", [(10, 0, -10, 5), (0, 0, 0, 5), (math.nan, 0, 1, 1), (900, 900, 950, 950)])
-def test_useless_bounds_are_refused(crossing, bounds):
+def test_invalid_bounds_are_refused(crossing, bounds):
     with pytest.raises(MapError, match="bounds"):
         draw_map(crossing, bounds=bounds)
 

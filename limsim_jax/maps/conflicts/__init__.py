@@ -1,9 +1,12 @@
-"""Where paths meet, and which of two vehicles goes first: geometry and right of way, once per map.
+"""Where the paths of vehicles meet, and the right of way there.
 
-Two lanes conflict where vehicles centred on them come too close: the distance between the centre lines is
-below the width of a vehicle and a margin. `overlaps` finds these stretches, `priority` orders them, `waiting`
-says where a vehicle can wait inside a junction, `build` writes all of it into a `table`: arrays of fixed size
-for the device. Everything but the table itself runs on the host in float64.
+Two lanes conflict where vehicles centred on them come too close: the centre lines are nearer to each other
+than the width of a vehicle and a margin. The package works once per map, on the host in float64:
+
+- `overlaps` finds the stretches where that holds;
+- `priority` decides which of the two lanes has the right of way;
+- `waiting` finds where a vehicle can wait inside a junction;
+- `build` writes all of it into a `table` of fixed size for the device.
 """
 
 from limsim_jax.maps.conflicts.build import build_conflicts

@@ -27,25 +27,16 @@ def build_conflicts(
     margin: float = MARGIN,
     break_cycles: bool = True,
 ) -> ConflictTable:
-    """Find all conflicts of a network, and who goes first.
+    """Find all conflicts of a network and their right of way.
 
-    Args:
-        network: The map.
-        rows: Row of every drivable lane (`lane_map.lane_rows`).
-        vehicle_width: Width (m) of the vehicles whose swept paths are compared.
-        margin: Free space (m) that they need between them.
-        break_cycles: Make equal what general rules (not the file, not signs) order in a circle, as
-            right before left does when four cars meet; `tie` keeps the rule. Without it, the circles
-            stay in `prio`.
+    The comparison covers lanes of the same junction (of one road only those side by side), and lanes
+    anywhere that share a successor or a predecessor. Outside junctions the 200 m next to the shared
+    lane count. Lanes more than 3.5 m apart in elevation pass over each other.
 
-    Compared are lanes of the same junction, of one road only those side by side, and lanes anywhere that
-    share a successor or a predecessor. Outside junctions the 200 m next to the shared lane count.
-    Lanes more than 3.5 m apart in elevation pass over each other.
+    Diverging paths need no priority, and paths that sweep are equal. For the others the first rule that
+    distinguishes them decides:
 
-    Diverging paths need no priority, and those that sweep are equal. For the others the first rule that
-    tells them apart decides:
-
-    1. what the file says (`Movement.yields_to`); where both yield to each other they are equal;
+    1. the file (`Movement.yields_to`); two movements that yield to each other are equal;
     2. control: priority before none or signal before yield, stop and all-way stop; zipper is equal;
     3. roundabouts: lanes that leave the ring or stay on it before lanes that enter. A ring is a
        closed path of at most 600 m that turns evenly once round;
@@ -56,6 +47,15 @@ def build_conflicts(
 
     Signals set no priority: the rules hold between movements that are green together, and for all
     when the lights are off.
+
+    Args:
+        network: The map.
+        rows: Row of every drivable lane (`lane_map.lane_rows`).
+        vehicle_width: Width (m) of the vehicles whose swept paths are compared.
+        margin: Free space (m) that they need between them.
+        break_cycles: Make the connectors of a cycle equal where general rules order them, not the file
+            or signs: right before left makes a cycle when four cars meet. `tie` keeps the rule.
+            Without `break_cycles` the cycles stay in `prio`.
     """
     lanes = connectors(network)
     index = {lane.id: k for k, lane in enumerate(lanes)}

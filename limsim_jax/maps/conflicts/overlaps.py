@@ -1,7 +1,7 @@
-"""Stretches where two lanes come so close that vehicles on them would touch.
+"""Stretches of two lanes on which vehicles would touch.
 
-A stretch crosses, merges or diverges. Where two lanes keep clear of each other, but the ends of long bodies
-in bends would touch, the bodies sweep: a conflict for those alone.
+Such a stretch crosses, merges or diverges. Two lanes may also keep clear of each other while the ends of
+long bodies in bends touch: these sweep, which is a conflict of long bodies alone.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ CLEARANCE = 3.5
 """Difference of elevation (m) above which one lane passes over the other."""
 
 LONGEST = 12.0
-"""Length (m) of the longest body whose sweep is looked at."""
+"""Length (m) of the longest body that sweeps."""
 
 _STEP = 0.25  # m, sampling of the centre lines
-_REACH = 200.0  # m, how far from a merge or split outside junctions two lanes are compared
+_REACH = 200.0  # m, from a merge or split outside junctions, on which two lanes are compared
 _STEP_ASIDE = 8.0  # m at the end of a lane that jumps aside to another one
-_BEND = 5.0  # m, over which the curvature that bodies sweep by is averaged: that of a car
+_BEND = 5.0  # m, over which curvature is averaged for sweeps: the length of a car
 _TOUCH = 0.05  # m, a stretch that starts or ends this close to an end of its lane reaches it
 
 
@@ -82,10 +82,19 @@ def connectors(network: Network) -> list[Lane]:
 
 
 def find_overlaps(network: Network, lanes: Sequence[Lane], width: float, margin: float) -> list[Overlap]:
-    """All stretches where centre lines of `lanes` come closer than `width` and `margin` (m), each pair once.
+    """All stretches on which two of these lanes come too close.
 
-    `first` and `second` are positions in `lanes`, first < second. Ends are exact to about 1 cm for
-    paths that cross at more than 30 degrees; at flat angles the closeness itself is exact to 5 mm.
+    Ends are exact to about 1 cm for paths that cross at more than 30 degrees. At flat angles the
+    distance itself is exact to 5 mm.
+
+    Args:
+        network: The map.
+        lanes: The lanes to compare, see `connectors`.
+        width: Width of vehicles, m.
+        margin: Free space that they need between them, m.
+
+    Returns:
+        Overlaps, each once; `first` and `second` are positions in `lanes`, first < second.
     """
     curves, reach = _Curves(lanes), width + margin
     regions = []
@@ -109,9 +118,9 @@ def find_overlaps(network: Network, lanes: Sequence[Lane], width: float, margin:
 
 
 def _merges_with_a_jump(lanes: Sequence[Lane], overlaps: Sequence[Overlap]) -> Iterator[Overlap]:
-    """Ends of lanes that lead to the same lane though they are too far apart for their paths to meet.
+    """Merges of lanes that do not come close to each other.
 
-    Some files let a lane end beside another one and go on as it: vehicles step aside there.
+    In some files a lane ends beside another one and continues as that one: vehicles step aside there.
     """
     index = {lane.id: k for k, lane in enumerate(lanes)}
     known = {(o.first, o.second) for o in overlaps if o.type is ConflictType.MERGE}
@@ -134,11 +143,11 @@ def _merges_with_a_jump(lanes: Sequence[Lane], overlaps: Sequence[Overlap]) -> I
 def _sweeps(
     lanes: Sequence[Lane], curves: _Curves, overlaps: Sequence[Overlap], width: float
 ) -> Iterator[Overlap]:
-    """Lanes that keep clear of each other, but not of the ends of long bodies.
+    """Stretches on which only the ends of long bodies meet.
 
-    In a bend of curvature kappa these stand out by kappa l^2 / 8, for bodies that lie on the lane at their
-    centre, along it. Bodies of `LONGEST` meet while both centres are within the stretch: that much of it is
-    left at its ends for fronts and rears.
+    A body of length l that lies on the lane at its centre, along the lane, stands out by kappa l^2 / 8 in
+    a bend of curvature kappa. Bodies of `LONGEST` meet while both centres are within the stretch.
+    `_between_ends` turns these centres into the stretch of fronts and rears.
     """
     known = {(o.first, o.second) for o in overlaps}
     most = math.pi / 8 * LONGEST  # m, two bodies together, each in a turn of 90 degrees
@@ -160,7 +169,7 @@ def _sweeps(
         p, q = np.nonzero(near)
         s_in, s_out = _between_ends(curves.s[a], p)
         f_in, f_out = _between_ends(curves.s[b], q)
-        # where the shortest of equal bodies meet
+        # where the shortest two bodies of equal length meet
         meet = np.unravel_index(np.argmax((out + out_foe) / room), room.shape)
         yield Overlap(
             first=first,
@@ -176,7 +185,10 @@ def _sweeps(
 
 
 def _between_ends(s: Floats, meet: NDArray[np.intp]) -> tuple[float, float]:
-    """Where fronts enter and rears leave, of bodies of `LONGEST` that meet with centres at these samples."""
+    """Where fronts enter a sweep, and rears leave it (m).
+
+    `meet` are the samples at which the centre of a body of `LONGEST` is while it touches the other.
+    """
     begin, end = float(s[meet.min()]), float(s[meet.max()])
     middle, half = (begin + end) / 2, max((end - begin - LONGEST) / 2, 0.5)
     return max(middle - half, float(s[0])), min(middle + half, float(s[-1]))
@@ -193,7 +205,7 @@ def sharing(lanes: Mapping[str, Lane], links: str) -> dict[str, list[Lane]]:
 
 @dataclass(frozen=True)
 class _Region:
-    """Samples p0..p1 of curve a and q0..q1 of curve b between which the distance is short."""
+    """Samples of two curves that are close: p0..p1 of a and q0..q1 of b."""
 
     a: int
     b: int
@@ -229,12 +241,18 @@ class _Curves:
         return len(self.owner) - 1
 
     def boxes_meet(self, a: NDArray[np.int_], b: NDArray[np.int_], reach: float) -> Any:
-        """Whether the bounding boxes of the curves come closer than `reach`, and `CLEARANCE` in z."""
+        """Whether bounding boxes come closer than `reach` (m).
+
+        In height they come closer than `CLEARANCE`.
+        """
         room = np.array([reach, reach, CLEARANCE])
         return ((self.low[a] <= self.high[b] + room) & (self.low[b] <= self.high[a] + room)).all(-1)
 
     def sweep(self, a: int) -> Floats:
-        """kappa / 8 (1/m) to the outside of the bend, `[samples, 2]`: times l^2, how far ends stand out."""
+        """kappa / 8 (1/m) towards the outside of the bend, `[samples, 2]`.
+
+        Times l^2 it is how far the ends of a body of length l stand out.
+        """
         s, xy = self.s[a], self.xyz[a][:, :2]
         heading = np.unwrap(np.arctan2(*np.gradient(xy, axis=0).T[::-1]))
         bend = np.interp(s + _BEND / 2, s, heading) - np.interp(s - _BEND / 2, s, heading)
@@ -256,7 +274,10 @@ class _Curves:
         return found
 
     def distance(self, a: int, b: int) -> Floats:
-        """Distance in plan between all samples of two curves, infinite where one passes over."""
+        """Distance in plan between all samples of two curves, m.
+
+        It is infinite where one curve passes over the other.
+        """
         distance = np.asarray(cdist(self.xyz[a][:, :2], self.xyz[b][:, :2]), np.float64)
         top, bottom = max(self.high[a, 2], self.high[b, 2]), min(self.low[a, 2], self.low[b, 2])
         if top - bottom > CLEARANCE:
@@ -265,10 +286,10 @@ class _Curves:
         return distance
 
     def refine(self, regions: Sequence[_Region], reach: float) -> Float[np.ndarray, "R 4"]:
-        """s_in, s_out, f_in, f_out (m) of every region, interpolated between the samples.
+        """s_in, s_out, f_in, f_out (m) of every region, interpolated between samples.
 
-        The distance of a sample from the other curve is taken to the chords next to its nearest
-        sample within the region; between the last sample out and the first one in it is linear.
+        The distance of a sample from the other curve is that from the chords next to its nearest
+        sample within the region. Between the last sample outside and the first one inside, it is linear.
         """
         edges = [
             edge
@@ -288,12 +309,12 @@ class _Curves:
         at_end = (inside + step < 0) | (inside + step >= np.diff(start)[curve])
         i = start[curve] + inside
         o = np.where(at_end, i, i + step)
-        # Some samples more on both sides: what is nearest to the sample outside may lie just beyond.
+        # More samples on both sides: the one nearest to the sample outside may lie just beyond.
         lo = start[other] + np.maximum(lo - 3, 0)
         hi = np.minimum(start[other] + hi + 3, start[other + 1] - 1)
         d_in, d_out = (_distance_to_curve(xyz, point, lo, hi) for point in (i, o))
-        # Chords may be a little closer than samples: then the end lies beyond the sample outside. If
-        # that is much too close, a bridge has ended the stretch.
+        # Chords may be a little closer than samples: then the end lies beyond the sample outside. A
+        # sample outside that is far too close was cut off by a bridge.
         away = ~at_end & (d_out > d_in) & (d_out > reach - 0.01)
         u = np.clip((reach - d_in) / np.where(away, d_out - d_in, np.inf), 0.0, 2.0)
         ends = s[i] + u * (s[o] - s[i])
@@ -303,7 +324,11 @@ class _Curves:
 def _distance_to_curve(
     xyz: Floats, point: NDArray[np.int_], lo: NDArray[np.int_], hi: NDArray[np.int_]
 ) -> Floats:
-    """Distance in plan from samples `point` to the polylines through the samples lo..hi."""
+    """Distance in plan from points to polylines, m.
+
+    `point`, `lo` and `hi` count samples: each polyline runs through samples lo..hi. Only
+    the chords next to the nearest sample count.
+    """
     xy = xyz[:, :2]
     count = hi - lo + 1
     first = np.cumsum(count) - count
@@ -322,7 +347,7 @@ def _distance_to_curve(
 
 
 def _candidates(lanes: Sequence[Lane], curves: _Curves, reach: float) -> list[tuple[int, int]]:
-    """Pairs of curves that may conflict."""
+    """Pairs of curves that can conflict, first < second."""
     index = {lane.id: k for k, lane in enumerate(lanes)}
     by_id = {lane.id: lane for lane in lanes}
     followers = [_followers(lane, by_id, reach) for lane in lanes]
@@ -339,7 +364,7 @@ def _candidates(lanes: Sequence[Lane], curves: _Curves, reach: float) -> list[tu
             inside[lane.junction].append(k)
     for members in inside.values():
         for i, j in itertools.combinations(members, 2):
-            # Of one road only lanes side by side: the others follow each other, or are oncoming.
+            # Lanes of one road count only side by side: the others follow each other, or are oncoming.
             if lanes[i].road != lanes[j].road or lanes[i].carriageway == lanes[j].carriageway:
                 add(i, j, curves.head)
     for links, curve in (("successors", curves.tail), ("predecessors", curves.head)):
@@ -352,7 +377,7 @@ def _candidates(lanes: Sequence[Lane], curves: _Curves, reach: float) -> list[tu
 
 
 def _followers(lane: Lane, lanes: Mapping[str, Lane], reach: float) -> set[str]:
-    """Lanes whose start is nearer than `reach` beyond the end of this one on the way ahead."""
+    """Ids of lanes that start less than `reach` m after this one."""
     found: set[str] = set()
     todo = [(name, 0.0) for name in lane.successors]
     while todo:
@@ -366,10 +391,10 @@ def _followers(lane: Lane, lanes: Mapping[str, Lane], reach: float) -> set[str]:
 def _classify(network: Network, lanes: Sequence[Lane], overlaps: list[Overlap]) -> list[Overlap]:
     """Tell crossing, merging and diverging stretches apart.
 
-    A stretch diverges if both lanes start there and come from the same lane, and merges if both end
-    there and lead to the same lane (or end side by side, closer than vehicles can pass). Lanes of one
-    road that come too close side by side merge there too: vehicles pass one behind the other. Where a
-    movement runs over several lanes, the kind carries over from one of them to the next.
+    A stretch diverges if both lanes start there and come from the same lane. It merges if both end there
+    and lead to the same lane, or end side by side too close for vehicles to pass. Lanes of one road that
+    come too close side by side merge, too: vehicles pass one behind the other. Where a movement runs over
+    several lanes, the kind carries over from one lane to the next.
     """
     index = {lane.id: k for k, lane in enumerate(lanes)}
     ahead = [[index[x] for x in lane.successors if x in index] for lane in lanes]
@@ -404,8 +429,8 @@ def _classify(network: Network, lanes: Sequence[Lane], overlaps: list[Overlap]) 
     def between(i: int, j: int) -> list[int]:
         return by_pair.get((min(i, j), max(i, j)), [])
 
-    # What diverges at the end of one lane still does so at the start of the next; merging likewise,
-    # against the direction of travel.
+    # Lanes that diverge at the end of one lane still do so at the start of the next. Merging carries
+    # over in the same way, against the direction of travel.
     todo = [n for n, kind in enumerate(kinds) if kind is not ConflictType.CROSS]
     while todo:
         n = todo.pop()
@@ -434,10 +459,10 @@ def _classify(network: Network, lanes: Sequence[Lane], overlaps: list[Overlap]) 
                         todo.append(m)
 
     def level(o: Overlap) -> Overlap:
-        """Where one way goes on beside the other, the stretch begins (or ends) level on both.
+        """Begin or end the stretch level on both lanes.
 
-        The end of the one is near a whole piece of the other: vehicles that follow each other through a
-        merge or a split measure their gap from there.
+        Where one lane continues beside the other, its end is near a whole piece of that one. Vehicles
+        that follow each other through a merge or a split measure their gap from there.
         """
         i, j = lanes[o.first], lanes[o.second]
         diverges = o.type is ConflictType.DIVERGE
@@ -456,6 +481,6 @@ def _classify(network: Network, lanes: Sequence[Lane], overlaps: list[Overlap]) 
 
 
 def _closest(lane: Lane, start: float, end: float, point: Floats) -> float:
-    """Arc length (m) between `start` and `end` at which a lane comes closest to a point."""
+    """Arc length (m), from `start` to `end`, nearest to a point."""
     s = np.linspace(start, end, max(2, math.ceil((end - start) / 0.05) + 1))
     return float(s[np.argmin(np.hypot(*(lane.pose(s)[0][:, :2] - point[:2]).T))])

@@ -1,4 +1,4 @@
-"""Right of way: which of two vehicles goes first where their paths meet."""
+"""Right of way: which of two paths that meet has priority."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ Floats = NDArray[np.float64]
 
 
 class Rule(enum.IntEnum):
-    """Rules of right of way, the weakest first: circles are broken in this order, up to `RING`."""
+    """Rules of right of way, the weakest first.
+
+    Cycles are broken in this order, up to `RING`.
+    """
 
     NONE = 0
     SIDE = 1
@@ -61,7 +64,7 @@ _LEFT, _RIGHT = (Turn.LEFT, Turn.SLIGHT_LEFT), (Turn.RIGHT, Turn.SLIGHT_RIGHT)
 
 @dataclass(frozen=True)
 class Path:
-    """One way over a connector: a movement, or the connector alone where no movement has it."""
+    """One path over a connector: a movement, or the connector alone."""
 
     movement: Movement | None
     approach: float  # rad, heading with which it comes in
@@ -73,17 +76,17 @@ class Path:
 
     @property
     def near_side(self) -> bool:
-        """Whether it turns without crossing the opposite direction."""
+        """Whether it turns without crossing oncoming traffic."""
         return self.turn in (_LEFT if self.left_hand else _RIGHT)
 
     @property
     def far_side(self) -> bool:
-        """Whether it turns across the opposite direction."""
+        """Whether it turns across oncoming traffic."""
         return self.turn in (_RIGHT if self.left_hand else _LEFT)
 
 
 class RightOfWay:
-    """Who goes first where paths meet."""
+    """Decides which of two connectors has priority where they meet."""
 
     def __init__(self, network: Network, lanes: Sequence[Lane]) -> None:
         self.network, self.lanes = network, lanes
@@ -100,12 +103,12 @@ class RightOfWay:
         self._paths: dict[int, list[Path]] = {}
 
     def only_movement(self, k: int) -> int:
-        """Index of the movement over a connector if it is the only one, else -1."""
+        """Index of the only movement over a connector; -1 for none or several."""
         movements = self.through[self.lanes[k].id]
         return movements[0].index if len(movements) == 1 else -1
 
     def paths(self, k: int) -> list[Path]:
-        """All ways over a connector."""
+        """All paths over a connector: its movements, or the connector alone."""
         if k not in self._paths:
             lane = self.lanes[k]
             movements = self.through[lane.id] or self.direct[lane.id]
@@ -133,7 +136,7 @@ class RightOfWay:
         )
 
     def decide(self, overlap: Overlap) -> Decision:
-        """Who goes first in this stretch, seen from its first lane, and by which rule.
+        """Priority in a stretch, seen from its first lane.
 
         Where several movements run over a lane, the strongest rule between any two of them counts.
         """
@@ -183,7 +186,7 @@ def _sign(x: int) -> int:
 
 
 def _turn(angle: float) -> Turn:
-    """Turn of a connector that no movement describes, from its change of heading (rad)."""
+    """Turn of a connector by its change of heading (rad)."""
     if abs(angle) < math.radians(30):
         return Turn.STRAIGHT
     if abs(angle) > math.radians(150):
@@ -202,11 +205,11 @@ def _turn_rank(path: Path, opposing: bool) -> int:
 def ring_lanes(
     network: Network, lanes: Sequence[Lane], *, longest: float = 600.0, uneven: float = 0.35
 ) -> set[str]:
-    """Ids of the lanes that circulate in a roundabout, as far as they lie on a ring with one of `lanes`.
+    """Ids of lanes on roundabouts that contain one of `lanes`.
 
-    The shortest way from such a lane back to itself must be at most `longest` (m), turn once to the left
-    (to the right with left-hand traffic), and its heading must stay within `uneven` (rad) of that on a
-    circle. Roundabouts stay below 0.15; a square with sharp corners is off by pi/4, an octagon by pi/8.
+    The shortest path from such a lane back to itself is at most `longest` m long. It turns once to the left,
+    or to the right with left-hand traffic, and its heading stays within `uneven` (rad) of that on a circle.
+    Roundabouts stay below 0.15; a square with sharp corners is off by pi/4, an octagon by pi/8.
     """
     everything = list(network.drivable_lanes())
     row = {lane.id: i for i, lane in enumerate(everything)}
@@ -249,7 +252,7 @@ def ring_lanes(
 
 
 def _turns_evenly(courses: Iterable[tuple[Floats, Floats]], direction: int, uneven: float) -> bool:
-    """Whether a closed path turns once round, at an even rate."""
+    """Whether a closed path makes one full turn at an even rate."""
     at, headings, base = [], [], 0.0
     for s, heading in courses:
         if headings:  # lanes join without full turns
@@ -266,7 +269,7 @@ def _turns_evenly(courses: Iterable[tuple[Floats, Floats]], direction: int, unev
 
 
 def movement_groups(movement: NDArray[np.int32]) -> NDArray[np.int_]:
-    """A number per connector that those of one movement share."""
+    """A number for each connector; connectors of one movement share it."""
     alone = np.arange(len(movement)) + movement.max(initial=0) + 1
     return np.unique(np.where(movement < 0, alone, movement), return_inverse=True)[1]
 
@@ -274,7 +277,15 @@ def movement_groups(movement: NDArray[np.int32]) -> NDArray[np.int_]:
 def without_cycles(
     ends: NDArray[np.int_], prio: NDArray[np.int_], rule: NDArray[np.int_]
 ) -> NDArray[np.int_]:
-    """Make equal what lies on a circle, the weakest rule first; signs and the file are left alone."""
+    """Make connectors on a cycle equal, the weakest rule first.
+
+    Signs and the file stay as they are.
+
+    Args:
+        ends: the two connectors of each conflict `[O, 2]`.
+        prio: priority of the first over the second `[O]`.
+        rule: `Rule` that decided `[O]`.
+    """
     prio = prio.copy()
     size = int(ends.max(initial=0)) + 1
     for weakest in (Rule.SIDE, Rule.ROAD, Rule.TURN, Rule.RAMP, Rule.RING):
@@ -285,11 +296,11 @@ def without_cycles(
 
 
 def priority_cycles(table: ConflictTable) -> list[list[int]]:
-    """Circles in which everyone yields to the next: a shortest one of every cyclic group.
+    """Cycles of connectors that each yield to the next: a shortest one of every cyclic group.
 
-    Each is a list of connectors of which every one yields to the one that follows, and the last to
-    the first. An empty list means that somebody can always go. Consecutive connectors of the same
-    movement count as one. Circles remain only where the file or signs set them.
+    The last connector of a cycle yields to the first. Without a cycle, at least one vehicle at a junction
+    can always go. Consecutive connectors of the same movement count as one. Cycles remain only where the
+    file or signs set them.
     """
     foe, prio, movement = (np.asarray(x) for x in (table.foe, table.prio, table.movement))
     nodes = movement_groups(movement)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 Array = np.ndarray | jax.Array
 
 ABSENT = 1e6
-"""Arc length (m) of an entry that is not there: far ahead of everything."""
+"""Arc length (m) of a free slot: far ahead of everything."""
 
 
 class ConflictType(enum.IntEnum):
@@ -22,16 +22,18 @@ class ConflictType(enum.IntEnum):
     CROSS = 1
     MERGE = 2  # they end in the same lane
     DIVERGE = 3  # they start in the same lane
-    SWEEP = 4  # only the ends of bodies in bends meet: of those that are long enough
+    SWEEP = 4  # only the ends of long bodies in bends meet
 
 
 @flax.struct.dataclass(kw_only=True)
 class ConflictTable:
-    """Conflicts of every connector, with all that is needed to decide who waits where.
+    """Conflicts of every connector: where they lie, and which vehicle yields.
 
-    Rows are the `K - 1` connectors and, last, an inert null connector, so that -1 is a safe index:
-    lanes inside junctions, and lanes elsewhere that share a successor or a predecessor with another.
-    The `C` slots of a row hold its conflicts by ascending `s_in`; free slots have `foe` -1, type
+    Rows are the `K - 1` connectors and, last, an inert null connector, so that -1 is a safe index.
+    Connectors are the lanes inside junctions, and lanes elsewhere that share a successor or a
+    predecessor with another lane.
+
+    The `C` slots of a row hold its conflicts by ascending `s_in`. Free slots have `foe` -1, type
     `NONE` and arc lengths `ABSENT`. Two lanes that meet in several separate stretches have several
     entries. Every entry has a mirror image in the row of its foe, with `prio` and `tie` negated.
 
@@ -42,7 +44,7 @@ class ConflictTable:
     connector: Int[Array, " L"]  # connector of each lane row, -1 for other lanes and the null lane
     movement: Int[Array, " K"]  # the movement through the connector; -1 if there is none or several
     length: Float[Array, " K"]  # m
-    wait_s: Float[Array, " K"]  # m from here along the movement, where to wait for foes inside; 0: nowhere
+    wait_s: Float[Array, " K"]  # m ahead along the movement, where to wait for foes inside; 0: nowhere
     clear_s: Float[Array, " K"]  # m, end of the last crossing or merging stretch; 0 without any
     cross_s: Float[Array, " K"]  # m, end of the last crossing stretch, to be kept clear; 0 without any
     must_stop: Bool[Array, " K"]  # begins at a stop sign
@@ -53,15 +55,15 @@ class ConflictTable:
     f_out: Float[Array, "K C"]
     type: Int[Array, "K C"]  # ConflictType
     prio: Int[Array, "K C"]  # +1 goes before the foe, 0 equal, -1 yields
-    tie: Int[Array, "K C"]  # the same between equals that arrive together (right before left), else 0
+    tie: Int[Array, "K C"]  # the same between equals that arrive together (right before left), or 0
     # 1/m^2: two bodies of lengths l and l_foe meet in a sweep where l^2 sweep + l_foe^2 f_sweep > 1
     sweep: Float[Array, "K C"]
     f_sweep: Float[Array, "K C"]
 
     def pad(self, *, lanes: int, connectors: int, foes: int) -> ConflictTable:
-        """The same table with these numbers of rows (null rows included) and slots.
+        """The same table with more rows and slots; the null row stays last.
 
-        Raises `ValueError` if the table does not fit.
+        `lanes` and `connectors` count the null rows, too. Raises `ValueError` if the table does not fit.
         """
 
         def null_last(x: Array, rows: int, fill: float) -> np.ndarray:

@@ -21,11 +21,14 @@ def waiting_points(
     before: float = 1.0,
     at_least: float = 6.0,
 ) -> list[float]:
-    """Where traffic may wait inside the junction: arc length (m) from each connector, 0 for nowhere.
+    """Where traffic can wait inside the junction.
 
-    The point lies 1 m before the first conflict with a foe that goes first, and at least 6 m into the
-    junction. It exists for movements that the file lets wait inside; where the file does not speak of
-    this at all, for turns across opposing traffic.
+    The point lies `before` m ahead of the first conflict with a foe that has priority, and `at_least` m
+    into the junction. The file says which movements have one. A file that says nothing of this has one
+    for every turn across opposing traffic.
+
+    Returns:
+        Arc length (m) from the start of each connector, 0 for nowhere.
     """
     index = {lane.id: k for k, lane in enumerate(lanes)}
     waiting = [0.0] * len(lanes)
@@ -51,7 +54,7 @@ def waiting_points(
 
 
 def _opposed(movement: Movement, k: int, foes: Iterable[tuple[float, int]], right_of_way: RightOfWay) -> bool:
-    """Whether a movement turns across traffic from the opposite side that goes first."""
+    """Whether a movement turns across opposing traffic that has priority."""
     own = next(path for path in right_of_way.paths(k) if path.movement is movement)
     return own.far_side and any(
         abs(math.remainder(path.approach - own.approach, math.tau)) > math.radians(120)

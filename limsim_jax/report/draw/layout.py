@@ -1,4 +1,4 @@
-"""Which windows of a map a page shows: strips of long thin maps, and details that a small scale hides."""
+"""Windows of a map on a page: strips of long thin maps, and details."""
 
 from __future__ import annotations
 

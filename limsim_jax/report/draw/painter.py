@@ -87,7 +87,7 @@ class Painter:
         self.legend: dict[str, dict[str, Any]] = {}  # label -> style of its sample
 
     def paint(self, *, zones: Zones | None, labels: bool) -> None:
-        """Draw all layers from the ground up, with conflict `zones` and `labels` if they are wanted."""
+        """Draw all layers from the ground up; `zones` and `labels` are optional."""
         self.draw_surfaces()
         self.draw_marks()
         self.draw_arrows()
@@ -109,7 +109,7 @@ class Painter:
         return artist
 
     def points(self, metres: float, least: float, most: float) -> float:
-        """A length in metres as points, clipped to sizes that the eye can use (points)."""
+        """A length in metres as points, clipped to `least` and `most` (points)."""
         return min(max(metres * self.ppm, least), most)
 
     def lines(self, layer: str, segments: Sequence[Any] | Array, zorder: float, **style: Any) -> None:
@@ -144,7 +144,10 @@ class Painter:
         return x0 <= position[0] <= x1 and y0 <= position[1] <= y1
 
     def bar(self, spot: LaneSpot, share: float = 1.0) -> Array | None:
-        """A bar `[2, 2]` across the lane at a spot, over a share of its width; None out of view."""
+        """A bar `[2, 2]` across the lane at a spot; None out of view.
+
+        It covers a share of the width.
+        """
         shape = self.shapes.get(spot.lane)
         return None if shape is None else shape.bar(spot.s, share)
 
@@ -170,7 +173,7 @@ class Painter:
             )
 
     def draw_marks(self) -> None:
-        """Borders of lanes outside junctions: solid where crossing is forbidden, dashed where allowed."""
+        """Borders of lanes outside junctions, see `outline.Mark`."""
         width = self.points(0.15, 0.25, 1.8)
         gap = max(0.12, 0.9 * width / self.ppm)  # m, half the distance of the lines of a double mark
         period = max(6.0, 5.0 / self.ppm)
@@ -185,7 +188,7 @@ class Painter:
                 lines[mark.kind].extend(dashes(line, mark.outline.road_s, period) if is_dashed else [line])
             self.lines("marks", lines["kerb"], level + 0.20, colors="#b9bfc7", linewidths=0.6 * width)
             self.lines("marks", lines["edge"], level + 0.22, colors=EDGE, linewidths=width)
-            # Where lanes are thinner than the marks would be, marks hide the lanes.
+            # Marks on lanes that are thinner would hide the lanes.
             if 3.5 * self.ppm > 2.0:
                 self.lines("marks", lines["solid"], level + 0.24, colors=MARK, linewidths=width)
                 self.lines("marks", lines["dashed"], level + 0.24, colors=MARK, linewidths=width)
@@ -198,7 +201,10 @@ class Painter:
                 self.legend["between directions"] = {"line": CENTRE, "on": road}
 
     def draw_arrows(self) -> None:
-        """Directions of travel: evenly spaced along roads, at most one per patch of the page."""
+        """Directions of travel, evenly spaced along roads.
+
+        Neighbouring lanes share an arrow where it is wider than a lane.
+        """
         length = max(3.6, 4.8 / self.ppm)  # m
         slim = length * self.ppm > 9.0
         width = 0.42 * length if slim else 0.8 * length
@@ -233,7 +239,7 @@ class Painter:
     def _arrow_places(shape: Outline, spacing: float, length: float) -> Array:
         lane = shape.lane
         low, high = sorted((float(shape.road_s[0]), float(shape.road_s[-1])))
-        # Both directions in one place would hide each other.
+        # Arrows of both directions in one place would hide each other.
         phase = 0.25 if shape.road_s[-1] >= shape.road_s[0] else 0.75
         k = np.arange(math.ceil(low / spacing - phase), math.floor(high / spacing - phase) + 1)
         s = np.atleast_1d(lane.s_at_road((k + phase) * spacing))
@@ -243,7 +249,7 @@ class Painter:
         return s[lane.width_at(s) > 1.0]
 
     def draw_connectors(self, faint: bool) -> None:
-        """Paths across junctions, coloured by the turn that they serve."""
+        """Paths across junctions, coloured by turn."""
         turn_of: dict[str, str] = {}
         for movement in self.network.movements:
             for lane in movement.via:
@@ -264,7 +270,7 @@ class Painter:
                 if not faint:
                     self.legend[turn] = {"line": color}
                 if self.ppm > 1.5 and not faint:
-                    # Near the exit, where paths have parted.
+                    # Near the exit, where paths have diverged.
                     long = [m for m in members if m.lane.length > 3 * length]
                     places = [m.at(0.8 * m.lane.length, m.centre) for m in long]
                     headings = [m.heading_at(0.8 * m.lane.length) for m in long]
@@ -315,7 +321,7 @@ class Painter:
             self.legend["crosswalk"] = {"zebra": True}
 
     def draw_stops(self) -> None:
-        """Stop lines of the file, and the ends of lanes that lights or signs hold."""
+        """Stop lines, and ends of lanes at lights or signs."""
         network = self.network
         top = max(self.levels.values(), default=0)
         width = self.points(0.5, 1.3, 3.5)
@@ -399,7 +405,7 @@ class Painter:
                         self.text("signs", sign.position[:2], text, top + 0.83, fontsize=0.5 * size)
 
     def draw_conflicts(self, zones: Zones) -> None:
-        """Stretches where paths cross, merge or part, as bands along them."""
+        """Stretches where paths cross, merge or diverge, as bands along them."""
         top = max(self.levels.values(), default=0)
         for order, (kind, color) in enumerate(_CONFLICTS.items()):
             bands = [
@@ -478,9 +484,9 @@ def draw_network(
 ) -> dict[str, list[Artist]]:
     """Draw a network on given axes: the base layer for maps, traffic and animations.
 
-    Sets limits and an equal aspect. Sizes that stand for no length on the road (marks, arrows, lights)
-    fit the scale that the axes have now, so place and size the axes first. A camera that moves at that
-    scale only has to change the limits: without `bounds` the whole map is on the axes.
+    Sets limits and an equal aspect. The sizes of symbols (marks, arrows, lights) fit the scale that the
+    axes have now, so place and size the axes first. Without `bounds` the whole map is on the axes: a camera
+    that moves at this scale only changes the limits.
 
     Args:
         ax: axes to draw on; x and y are metres.

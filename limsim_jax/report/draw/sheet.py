@@ -35,10 +35,11 @@ def draw_map(
     dpi: float = 160.0,
     size: tuple[float, float] | None = None,
 ) -> Figure:
-    """Draw a map on a page: title with counts and the import report, legend, scale bar, axes in metres.
+    """Draw a map on a page with title, legend and scale bar.
 
-    Lanes keep their true proportions. A long thin map is cut into strips that share one scale. Where
-    the scale of the whole map is too small to read its marks, windows below show details.
+    The title has counts and the import report; the axes are in metres. Lanes keep their true proportions.
+    A long thin map is cut into strips of one scale. Where the scale of the whole map is too small for its
+    marks, windows below show details.
 
     Args:
         network: the map.
@@ -49,8 +50,12 @@ def draw_map(
         dpi: pixels per inch of a PNG.
         size: width and height of the page in inches; chosen from the map if not given.
 
+    Returns:
+        The figure.
+
     Raises:
-        MapError: unknown suffix, file that cannot be written, a map without lanes, or useless `bounds`.
+        MapError: unknown suffix, a file that cannot be written, a map without lanes, `bounds` that are no
+            rectangle or show no lane, or a `size` that leaves no room.
         ModuleNotFoundError: matplotlib is not installed.
     """
     target = None if path is None else _checked_target(path)
@@ -110,7 +115,7 @@ def draw_map(
     overview = []
     for i, strip in enumerate(parts):
         row, column = (i, 0) if stacked else (0, i)
-        # Room that a strip does not need shows its surroundings, but never its neighbours.
+        # Spare room of a strip shows its surroundings, but never its neighbours.
         alone = len(parts) == 1
         spare_x = max(0.0, cell[0] / scale - wide) / 2 if alone or not stacked else 0.0
         spare_y = max(0.0, cell[1] / scale - tall) / 2 if alone or stacked else 0.0
@@ -139,7 +144,7 @@ def draw_map(
 
 
 def _frame(ax: Axes, window: Bounds, letter: str) -> None:
-    """Mark a detail window on the map where its middle is in view."""
+    """Mark a detail window on a map that shows its middle."""
     from matplotlib.patches import Rectangle
 
     x0, y0, x1, y1 = window
