@@ -10,6 +10,8 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
+import platformdirs
+
 
 def write_whole(path: str | Path, data: bytes | str) -> None:
     """Put `data` (text as UTF-8) under this name: all of it or nothing, safe from a power cut on return.
@@ -53,11 +55,14 @@ def check_writable(*paths: Path | None) -> None:
 
 
 def cache_directory() -> Path:
-    """The folder of cached maps and programs; it need not exist yet."""
+    """The folder of cached maps and programs; it need not exist yet.
+
+    It is `$LIMSIM_JAX_CACHE`, otherwise `limsim_jax` in the user's cache folder of the platform
+    (`$XDG_CACHE_HOME` or `~/.cache` on Linux).
+    """
     if own := os.environ.get("LIMSIM_JAX_CACHE"):
         return Path(own)
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "limsim_jax"
+    return platformdirs.user_cache_path("limsim_jax", appauthor=False)
 
 
 @contextlib.contextmanager

@@ -1,8 +1,8 @@
 """A cache on disk for what takes long to build from a map file.
 
-Entries lie in `$LIMSIM_JAX_CACHE`, else `$XDG_CACHE_HOME/limsim_jax`, else `~/.cache/limsim_jax`. The
-key of an entry covers the bytes of the map file and the source code that turns them into the entry, so
-an entry never goes stale: a changed file or another version of the package has another key.
+Entries lie in `files.cache_directory()`. The key of an entry covers the bytes of the map file and the
+source code that turns them into the entry, so an entry never goes stale: a changed file or another version
+of the package has another key.
 
 An entry is a pickle behind a header with its length and checksum. Pickle, because it is as fast as raw
 arrays here and keeps the types as they are; and harmless, because `_Unpickler` builds arrays, plain
@@ -29,8 +29,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 
-from limsim_jax import __version__
 from limsim_jax.files import cache_directory, no_garbage_collection
 
 logger = logging.getLogger(__name__)
@@ -141,7 +141,8 @@ _NUMPY = {"_frombuffer", "_reconstruct", "scalar"}  # how NumPy pickles arrays a
 @functools.cache
 def _fingerprint() -> bytes:
     """Hash of all that shapes an entry besides the map file: our source and the versions beneath it."""
-    digest = hashlib.sha256(repr((__version__, platform.python_version_tuple()[:2], np.__version__)).encode())
+    versions = (platform.python_version_tuple()[:2], np.__version__, shapely.__version__)
+    digest = hashlib.sha256(repr(versions).encode())
     for path in sorted([*_PACKAGE.glob("maps/**/*.py"), *_PACKAGE.glob("*.py")]):
         digest.update(path.read_bytes())
     return digest.digest()

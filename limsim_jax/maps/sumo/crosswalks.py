@@ -6,11 +6,11 @@ import math
 from collections import defaultdict
 
 import numpy as np
+import shapely
 from jaxtyping import Float
 
 from limsim_jax.maps.network import Array, Crosswalk, Lane
 from limsim_jax.maps.sumo.elements import Elements, polyline
-from limsim_jax.maps.sumo.shapes import distance_to_polyline
 
 
 def build_crosswalks(elements: Elements, lanes: dict[str, Lane]) -> tuple[Crosswalk, ...]:
@@ -55,21 +55,13 @@ def _spans(lane: Lane, outline: Float[Array, "K 2"]) -> list[tuple[float, float]
     i, j = np.nonzero(hit)
     cuts = np.concatenate([[0.0], np.sort(s[i] + u[i, j] * (s[i + 1] - s[i])), [lane.length]])
     middle = lane.pose((cuts[1:] + cuts[:-1]) / 2)[0][:, :2]
-    border = np.concatenate([outline, outline[:1]])
+    area = shapely.Polygon(outline)
+    inside = shapely.contains_xy(area, middle[:, 0], middle[:, 1])
+    along = shapely.distance(shapely.points(middle), area.exterior) < 0.05  # the border, not across it
     spans: list[tuple[float, float]] = []
-    for lo, hi, point in zip(cuts[:-1], cuts[1:], middle, strict=True):
-        grazing = distance_to_polyline(point[None], border)[0] < 0.05  # along the border, not across it
-        if hi - lo > 1e-6 and not grazing and _inside(point, outline):
+    for lo, hi, covered in zip(cuts[:-1], cuts[1:], inside & ~along, strict=True):
+        if covered and hi - lo > 1e-6:
             if spans and abs(spans[-1][1] - lo) < 1e-6:
                 lo = spans.pop()[0]
             spans.append((float(lo), float(hi)))
     return spans
-
-
-def _inside(point: Float[Array, " 2"], outline: Float[Array, "K 2"]) -> bool:
-    """Whether a point is in a polygon: an odd number of its edges lie to the right of it."""
-    a, b = outline, np.roll(outline, -1, axis=0)
-    straddles = (a[:, 1] > point[1]) != (b[:, 1] > point[1])
-    a, b = a[straddles], b[straddles]
-    x = a[:, 0] + (point[1] - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
-    return bool(np.count_nonzero(x > point[0]) % 2)

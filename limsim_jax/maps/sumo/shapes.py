@@ -12,6 +12,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import shapely
 from jaxtyping import Float
 from numpy.typing import NDArray
 
@@ -81,7 +82,10 @@ def wrap(angle: Any) -> Any:
 
 
 def _simplify(points: Float[Array, "K 3"], tolerance: float) -> NDArray[np.int64]:
-    """Indices of the vertices that the Douglas-Peucker algorithm keeps."""
+    """Indices of the vertices that the Douglas-Peucker algorithm keeps.
+
+    Distances are in space: `shapely.simplify` would ignore the height.
+    """
     keep = {0, len(points) - 1}
     stack = [(0, len(points) - 1)]
     while stack:
@@ -244,8 +248,6 @@ def _end_heading(segment: float, given: float | None, turn: Float[Array, " J"]) 
 
 def distance_to_polyline(xy: Float[Array, "M 2"], points: Float[Array, "K 2"]) -> Float[Array, " M"]:
     """Distance (m) of each point from the nearest place on a polyline."""
-    p, vertices = xy @ (1, 1j), points @ (1, 1j)
-    start, chord = vertices[:-1], np.diff(vertices)
-    offset = p[:, None] - start
-    u = (offset * (chord.conj() / np.maximum(np.abs(chord) ** 2, 1e-300))).real
-    return np.abs(offset - np.clip(u, 0.0, 1.0) * chord).min(1)
+    line = shapely.LineString(points)
+    shapely.prepare(line)
+    return shapely.distance(shapely.points(xy), line)
