@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 def _answer(source: Path, out: Path) -> None:
-    """Ask CARLA's parser about a map; write each answer as soon as it is there."""
+    """Ask CARLA's parser about a map, and write each answer at once."""
     import carla
 
     town = carla.Map("map", source.read_text(encoding="utf-8", errors="replace"))
@@ -75,7 +75,7 @@ def _answer(source: Path, out: Path) -> None:
 
 @dataclass(frozen=True)
 class CarlaMap:
-    """What CARLA's parser says about a map; fields that it crashed on are None."""
+    """Answers of CARLA's parser; those that it crashed on are None."""
 
     waypoints: Array | None  # [K, 10]: road, section, lane, s, x, y, heading, width, may change left, right
     topology: dict[str, Any] | None

@@ -1,4 +1,4 @@
-"""How far given poses are from our lanes, on the host (`Network`) and on the device (`LaneMap`)."""
+"""Distances of given poses from our lanes, on host and device."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.maps.network import Lane, LaneType, Network
 
-# What a map has to show, in SI units.
+# Thresholds for a map, in SI units.
 HOST_LATERAL = 1e-3
 DEVICE_LATERAL = 0.05
 DEVICE_MEDIAN = 0.01
@@ -25,7 +25,10 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Misfit:
-    """Deviations of given poses from our lanes, one entry per pose; NaN where no lane of ours is there."""
+    """Deviations of given poses from our lanes.
+
+    One entry per pose; NaN where no lane of ours is there.
+    """
 
     lateral: Array  # m, across the track
     along: Array  # m, along the track, from where the road coordinate says
@@ -33,7 +36,7 @@ class Misfit:
     width: Array  # m
     at: Array  # m, arc length of the foot point on the host lane
     device: Array  # m, across the track, of the device lane
-    may_left: Array  # 1 or 0 where our lane has a driving lane beside it, else NaN
+    may_left: Array  # 1 or 0 where our lane has a driving lane beside it, otherwise NaN
     may_right: Array
     lane: list[str]
 
@@ -49,7 +52,10 @@ class Misfit:
 
 
 def project(lane: Lane, xy: Array, s: Array) -> tuple[Array, Array, Array]:
-    """Arc length, signed offset to the left and residual along the lane of the points' local projections."""
+    """Project points on a lane.
+
+    Returns arc length (m), offset to the left (m) and the residual along the lane (m).
+    """
     for _ in range(8):
         position, heading = lane.pose(s)
         delta = xy - position[:, :2]
@@ -76,7 +82,10 @@ class OurMap:
         self._device = device_poses(network)
 
     def misfit(self, where: Sequence[tuple[str, int]], s: Array, pose: Array, width: Array) -> Misfit:
-        """Deviation of poses `[K, 3]` (m, m, rad), given at road coordinates `s` of (road, lane number)."""
+        """Deviation of poses `[K, 3]` (m, m, rad) from our lanes.
+
+        They are given at road coordinates `s` of (road, lane number).
+        """
         out = Misfit.empty(len(where))
         groups: dict[tuple[str, int], list[int]] = {}
         for i, place in enumerate(where):
@@ -123,9 +132,10 @@ class OurMap:
     def beside(
         self, marked: set[tuple[str, str, int]], stated: set[tuple[str, str, int]]
     ) -> set[tuple[str, str, int]]:
-        """Of these (signal, road, lane): the connectors that leave a lane by which the signal is passed.
+        """Of these (signal, road, lane): the connectors behind a signal.
 
-        Passed it is on the way into a connector that the file names for it, or on a lane that it names.
+        They leave a lane on which traffic passes the signal: one that the file names for it, or one that
+        leads into such a connector.
         """
         ways_in: dict[str, set[str]] = {}
         for signal, road, number in stated:
@@ -139,7 +149,7 @@ class OurMap:
         }
 
     def on_any_lane(self, pose: Array) -> NDArray[np.bool_]:
-        """Which of these poses lie on a driving lane of ours, whatever its name, within the device's 5 cm."""
+        """Which poses lie on one of our driving lanes, within 5 cm."""
         found = np.zeros(len(pose), bool)
         if not found.size:
             return found
@@ -155,7 +165,10 @@ class OurMap:
 
 
 def device_poses(network: Network) -> Callable[[Sequence[str], Array], tuple[Array, Array]]:
-    """A function (lane ids, s) -> positions `[K, 2]` and headings `[K]` on the device, then in float64."""
+    """A function that looks up poses on the device map.
+
+    It takes lane ids and arc lengths and returns positions `[K, 2]` and headings `[K]` in float64.
+    """
     import jax
     import jax.numpy as jnp
 

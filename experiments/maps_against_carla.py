@@ -1,4 +1,4 @@
-"""Our reading of OpenDRIVE maps against CARLA's parser and against the formulas of the standard.
+"""Our OpenDRIVE maps against CARLA's parser and the standard's formulas.
 
     python experiments/maps_against_carla.py [--maps DIR|FILE ...] [--json FILE] [--markdown FILE]
 
@@ -6,7 +6,7 @@ For every map: each driving waypoint that CARLA's parser generates (every 0.5 m)
 lane of ours with the same road, number and road coordinate, on the host (`Network`) and on the device
 (`LaneMap`). Movements across junctions, lane widths, permissions to change lanes, lights, signs and
 crosswalks are compared as well. Every driving lane is also compared with OpenDRIVE's formulas evaluated
-directly (`opendrive_formulas.py`), which settles who is right where CARLA and we differ.
+directly (`opendrive_formulas.py`), which decide where CARLA and we differ.
 
 CARLA's parser (PyPI `carla`) runs in a process of its own, as it crashes on some maps.
 """
@@ -150,7 +150,10 @@ JUMPS = "the lane breaks in the file: a short bridge in ours"
 def settle(
     ours: OurMap, truth: OpenDriveFormulas, waypoints: Array, where: Sequence[tuple[str, int]], fit: Misfit
 ) -> NDArray[np.str_]:
-    """Per waypoint of CARLA that misses our lane: why the file is on our side, or "" where it is not."""
+    """Why the file agrees with us where CARLA's waypoints miss our lanes.
+
+    One per waypoint; "" where it does not.
+    """
     reasons = np.full(len(waypoints), "", f"U{max(map(len, (CARLA_ERRS, NEGATIVE, JUMPS)))}")
     doubtful, poses, widths, valid = [], [], [], []
     for i in map(int, np.flatnonzero(fit.bad() | ~(fit.device < DEVICE_LATERAL))):
@@ -183,7 +186,7 @@ def settle(
 
 
 def bridge(truth: OpenDriveFormulas, road: str, number: int, s: float, exact: Misfit, k: int) -> bool:
-    """Whether the file breaks the lane here and ours only leads over the break.
+    """Whether our lane only bridges a break in the file.
 
     That is: off sideways by no more than the gap, and turned only where the file's own kink is (within
     a millimetre, where the cubic across gap and kink overshoots).
@@ -241,7 +244,7 @@ def compare_permissions(
 def compare_formulas(
     ours: OurMap, truth: OpenDriveFormulas, published: float | None, row: Comparison
 ) -> None:
-    """Our driving lanes at the formulas' places, about every metre, and their length."""
+    """Length and poses of our driving lanes, about every metre."""
     records, samples, poses, widths, excluded = [], [], [], [], 0
     for record in truth.driving_lanes():
         length = record.s1 - record.s0
@@ -298,7 +301,7 @@ def compare_formulas(
 
 
 def published_lengths() -> dict[Path, float]:
-    """Driving km of the shared maps in the table that comes with them."""
+    """Driving km of the shared maps, from the table beside them."""
     readme = SHARED / "opendrive" / "README.md"
     if not readme.is_file():
         return {}
@@ -316,7 +319,7 @@ def published_lengths() -> dict[Path, float]:
 
 
 def our_movements(network: Network) -> dict[str, set[tuple[LaneEnd, LaneEnd]]]:
-    """Junction -> movements of ours from driving lane over driving lanes to driving lane."""
+    """Junction -> our movements over driving lanes."""
     found: dict[str, set[tuple[LaneEnd, LaneEnd]]] = {junction: set() for junction in network.junctions}
     for movement in network.movements:
         lanes = [network.lanes[i] for i in (movement.incoming, *movement.via, movement.outgoing)]
@@ -343,7 +346,7 @@ def carla_movements(carla_map: CarlaMap, truth: OpenDriveFormulas) -> dict[str, 
 
 
 def compare_movements(ours: OurMap, carla_map: CarlaMap, truth: OpenDriveFormulas, row: Comparison) -> None:
-    """Ways across every junction: ours, CARLA's and those that the links of the file give."""
+    """Compare our movements with CARLA's and with the links of the file."""
     mine, linked = our_movements(ours.network), truth.movements()
     row.figures["junctions"] = len(linked)
     row.figures["movements"] = sum(map(len, mine.values()))
@@ -388,7 +391,7 @@ SIGNS = {"206": SignKind.STOP, "205": SignKind.YIELD}
 
 
 def compare_marks(ours: OurMap, carla_map: CarlaMap, truth: OpenDriveFormulas, row: Comparison) -> None:
-    """Lights, stop and yield signs with the driving lanes they govern, and crosswalks."""
+    """Lights and signs with the driving lanes they govern, and crosswalks."""
     network = ours.network
     names = integer_ids(truth.roads)
 
@@ -579,7 +582,7 @@ def map_files(given: Sequence[Path]) -> list[Path]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare maps, write the table, return 1 if any map misses a threshold."""
+    """Compare maps and write the table; 1 if a map misses a threshold."""
     from limsim_jax.maps.opendrive import read_opendrive
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])

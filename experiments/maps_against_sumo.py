@@ -81,7 +81,7 @@ class Comparison:
 
 
 def compare(path: Path, name: str | None = None) -> tuple[Comparison, Network]:
-    """Read a network with both readers and compare all that sumolib knows of it."""
+    """Read a network with both readers and compare all of sumolib's data."""
     theirs = sumolib.net.readNet(
         str(path), withInternal=True, withPrograms=True, withFoes=True, withPedestrianConnections=True
     )
@@ -133,7 +133,7 @@ def _lanes(result: Comparison, ours: Network, theirs: Any) -> None:
 
 
 def _dense(lane: Lane) -> Array:
-    """Points of the centre line (m), five from each sample to the next."""
+    """Points of the centre line (m), five per sample."""
     parts = np.linspace(lane.s[:-1], lane.s[1:], 5, endpoint=False, axis=1)
     return lane.pose(np.append(parts, lane.length))[0]
 
@@ -244,16 +244,19 @@ def _programs(result: Comparison, ours: Network, theirs: Any) -> None:
 
 @dataclass
 class Inside:
-    """Distance from the curves that netconvert samples inside junctions (m): mean and maximum over lanes."""
+    """Distance (m) from the curves that netconvert samples inside junctions.
+
+    Mean and maximum over lanes.
+    """
 
     name: str
     lanes: int
     polyline: tuple[float, float]  # of SUMO's usual five points per lane
-    ours: tuple[float, float]  # of what we make of them
+    ours: tuple[float, float]  # of our curves over them
 
 
 def compare_inside(path: Path, name: str, folder: Path) -> Inside:
-    """Have netconvert write the same net with 5 and with 50 points per lane inside junctions."""
+    """Compare nets with 5 and with 50 points per lane inside junctions."""
     made = {}
     for detail in (5, 50):
         made[detail] = folder / f"detail_{detail}.net.xml"
@@ -291,7 +294,7 @@ def generate(folder: Path) -> dict[str, Path]:
 
 
 def main(files: list[str]) -> int:
-    """Compare, write the tables, say whether all is equal."""
+    """Compare, write the tables, and return 1 if anything differs."""
     results = []
     inside = []
     with tempfile.TemporaryDirectory() as temporary:

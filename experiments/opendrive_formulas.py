@@ -1,4 +1,4 @@
-"""OpenDRIVE's formulas, evaluated directly at one place at a time: no sampling, no joining, no repair.
+"""OpenDRIVE's formulas, evaluated directly at one place at a time.
 
 A second referee beside CARLA's parser, for the places where CARLA is no oracle, and the truth of the
 property tests. It shares no code with `limsim_jax.maps.opendrive` and is slow and plain on purpose:
@@ -41,7 +41,7 @@ def _legendre(order: int) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Cubics:
-    """Cubic records `a b c d` that start at `s0`, of which the last one that has started holds."""
+    """Cubic records `a b c d`, each from its `s0` on."""
 
     s0: Array
     coefficients: Array  # [K, 4]
@@ -77,7 +77,7 @@ class Geometry:
     shape: Element
 
     def __call__(self, s: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """x, y, heading, and the derivatives of path and heading by the road coordinate, at `s`."""
+        """x, y, heading and the derivatives of path and heading at `s`."""
         u = s - self.s0
         kind = self.shape.tag
         if kind == "line":
@@ -101,7 +101,7 @@ class Geometry:
 
     @cached_property
     def _curve(self) -> tuple[Array, Array, float, Any]:
-        """Cubics of a parametric record, its length per road coordinate, and the parameter along it.
+        """Cubics of a parametric record, its stretch, and the parameter along it.
 
         `s` is arc length (OpenDRIVE 1.8, 7.1), not the parameter: dp/ds = 1 / |r'(p)|. Where the curve of
         a paramPoly3 is longer or shorter than its record says, the difference is spread evenly.
@@ -147,7 +147,7 @@ def _cubic(c: Array, p: Any) -> tuple[Any, Any, Any]:
 
 
 def _clothoid(k0: float, rate: float, u: Array) -> tuple[Array, Array]:
-    """x, y of a curve that starts along x with curvature `k0 + rate * u`."""
+    """x, y of a clothoid with curvature `k0 + rate * u`."""
     if rate and abs(k0 * k0 / rate) < 100:
         # Complete the square of the heading; the Fresnel integrals take pi/2 t^2.
         scale, shift = math.sqrt(abs(rate) / math.pi), k0 / rate
@@ -231,7 +231,7 @@ class RoadFormulas:
         return x, y, heading, speed, turn_rate
 
     def point(self, s: float, t: float, turn: float = 0.0, u: float = 0.0, v: float = 0.0) -> Array:
-        """A place `[2]`, `u, v` away from (s, t) in axes turned against the reference line."""
+        """The place `[2]` at `u, v` in turned axes at (s, t)."""
         x, y, heading, _, _ = (float(a[0]) for a in self.reference(s))
         c, n = math.cos(heading + turn), math.sin(heading + turn)
         return np.array(
@@ -322,7 +322,7 @@ class RoadFormulas:
         )
 
     def mark(self, section: int, number: int, to_left: bool, s: float) -> str:
-        """The road mark between a lane and its neighbour on one side of its traffic, in words."""
+        """The road mark between a lane and its neighbour on one side."""
         towards = 1 if to_left == self.runs_with_s(number) else -1  # lanes ascend to the left of the road
         neighbour = number + towards
         # A lane bears the mark of its border away from lane 0; lane 0 bears that between -1 and 1.
@@ -337,7 +337,7 @@ class RoadFormulas:
         return f"{mark.get('type')}, " + ("laneChange absent" if change is None else f"laneChange={change}")
 
     def breaks(self, number: int, s: float, reach: float) -> tuple[float, float]:
-        """Largest sideways gap (m) and kink (rad) in a lane's centre line within `reach` of `s`.
+        """Largest gap (m) and kink (rad) within `reach` of `s`.
 
         Gaps of 5 cm and more do not count: there another lane begins.
         """
@@ -361,7 +361,7 @@ class RoadFormulas:
         return max(gaps), max(kinks)
 
     def lane_length(self, record: LaneRecord) -> float:
-        """Arc length of a lane centre: Gauss-Legendre between all places where a record changes."""
+        """Arc length (m) of a lane centre, by Gauss-Legendre between records."""
         breaks = {record.s0, record.s1}
         breaks |= {g.s0 for g in self.geometries} | set(self.offset.s0.tolist())
         for (section, _), (records, _) in self._profiles.items():
@@ -403,9 +403,10 @@ class OpenDriveFormulas:
         return sum(self.roads[lane.road].lane_length(lane) for lane in self.driving_lanes())
 
     def signal_lanes(self) -> list[tuple[str, str, str, int]]:
-        """(type, id, road, lane number) of the driving lanes that signals and their references govern.
+        """The driving lanes that signals and their references govern.
 
-        Lanes of the validity records, or, without these, of the direction that `orientation` gives.
+        As (type, id, road, lane number). Lanes of the validity records, or, without these, of the
+        direction that `orientation` gives.
         """
         kinds = {signal.get("id"): signal.get("type", "") for signal in self.root.iter("signal")}
         found = []
@@ -432,7 +433,7 @@ class OpenDriveFormulas:
         return found
 
     def crosswalks(self) -> list[tuple[Array, Array]]:
-        """Corners `[K, 2]` of every crosswalk, and the same with the road's lane offset added to its `t`.
+        """Corners `[K, 2]` of every crosswalk, without and with the lane offset.
 
         `t` is measured from the reference line (OpenDRIVE 1.8, 7.3), to which the lane offset adds nothing.
         """
@@ -466,7 +467,7 @@ class OpenDriveFormulas:
         return {road.id for road in self.roads.values() if road.element.get("junction") == junction}
 
     def _joints(self) -> Iterator[tuple[LaneEdge, LaneEdge]]:
-        """Pairs of lane ends that a link of the file joins, in the order of the file."""
+        """Pairs of lane ends that a link joins, in file order."""
         for road in self.roads.values():
             last = len(road.sections) - 1
             for (section, number), lane in road.lane_elements.items():
@@ -506,10 +507,11 @@ class OpenDriveFormulas:
                     yield incoming.edge(first, end), road.edge(number, at_end)
 
     def movements(self) -> dict[str, set[tuple[LaneEnd, LaneEnd]]]:
-        """Junction id -> pairs of (incoming road, lane) and (outgoing road, lane) that driving lanes join.
+        """Junction id -> pairs of incoming and outgoing lanes (road, number).
 
-        A link says that two lane ends meet, whichever of the two roads records it; the traffic rule
-        says which way it is driven. A connection without lane links joins lanes of equal numbers.
+        Driving lanes join them. A link says that two lane ends meet, whichever of the two roads records
+        it; the traffic rule says which way it is driven. A connection without lane links joins lanes of
+        equal numbers.
         """
         successors: dict[LaneKey, set[LaneKey]] = {}
         for a, b in self._joints():
@@ -538,7 +540,7 @@ class OpenDriveFormulas:
 def paths_across(
     successors: Mapping[LaneKey, Iterable[LaneKey]], inside: Container[str]
 ) -> set[tuple[LaneEnd, LaneEnd]]:
-    """Pairs of lanes outside these roads that a path of lanes inside them joins."""
+    """Pairs of lanes outside these roads that lanes inside join."""
     found: set[tuple[LaneEnd, LaneEnd]] = set()
     for start, after in successors.items():
         if start[0] in inside:

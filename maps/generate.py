@@ -117,7 +117,7 @@ def ramp() -> Map:
 
 
 def intersection() -> Map:
-    """A signalised intersection with turn lanes; the south arm is bent and meets it at an angle."""
+    """A signalised intersection with turn lanes and a bent south arm."""
     m = Map("intersection")
     bent = [Piece(35), *arc(160, -30, 40), Piece(80)]
     arms = {
@@ -131,7 +131,7 @@ def intersection() -> Map:
 
 
 def roundabout_map() -> Map:
-    """A two-lane roundabout with four arms that are not quite at right angles."""
+    """A two-lane roundabout with four arms, not quite at right angles."""
     m = Map("roundabout")
     centre = Pose(0, 0, 0)
     shapes = {
@@ -150,7 +150,7 @@ def roundabout_map() -> Map:
 
 
 def long_route() -> Map:
-    """Town, lights, roundabout, on-ramp, motorway, off-ramp and a stop-controlled crossing in a row."""
+    """A route from town over a motorway to a stop-controlled crossing."""
     m = Map("long_route")
 
     # 1. a signalised intersection; the route starts on its west arm and leaves on the avenue

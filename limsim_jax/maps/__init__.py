@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
-# What the cache may know about a network: its file and nothing but its file has shaped it.
+# Networks that come straight from a file, with what identifies it: only these are cached.
 _loaded: weakref.WeakKeyDictionary[Network, tuple[str, ...]] = weakref.WeakKeyDictionary()
 
 
 def read_network(path: str | Path, *, cache: bool = True) -> Network:
-    """Read a road network from an OpenDRIVE (`.xodr`) or SUMO (`.net.xml`) file, also gzipped.
+    """Read a road network from an OpenDRIVE or SUMO file, also gzipped.
 
     The root element decides which of the two it is. With `cache` the result is kept on disk
     (`limsim_jax.maps.cache`), so that a second load of the same bytes is quick.
@@ -41,7 +41,7 @@ def read_network(path: str | Path, *, cache: bool = True) -> Network:
         network = dataclasses.replace(network, source=str(path))
     else:
         network = _read(path, xml.root_name(data, path))
-        if network.file_hash != file_hash:  # the file changed between the two looks at it
+        if network.file_hash != file_hash:  # the file changed between the two times that it was read
             return network
         if cache:
             _cache.store(name, network)
@@ -82,7 +82,7 @@ def build_lane_map(
 
 
 def _spell(goals: Goals | None) -> str:
-    """Equal for goals that make equal arrays: their names do not matter, their order does."""
+    """Text that is equal for goals that make equal arrays."""
     groups = goals.values() if isinstance(goals, Mapping) else goals
     return repr(groups and [group if isinstance(group, str) else list(group) for group in groups])
 
@@ -95,7 +95,7 @@ def bundled_maps() -> dict[str, Path]:
 
 
 def bundled_map(name: str) -> Path:
-    """The path of a map that comes with the package. Raises `MapError` if there is none of this name."""
+    """The path of a bundled map. Raises `MapError` for an unknown name."""
     maps = bundled_maps()
     if name not in maps:
         raise MapError(f"no such file, and no bundled map either; bundled are {', '.join(maps)}", file=name)

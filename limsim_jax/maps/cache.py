@@ -1,12 +1,12 @@
-"""A cache on disk for what takes long to build from a map file.
+"""A cache on disk for networks and lane maps.
 
 Entries lie in `files.cache_directory()`. The key of an entry covers the bytes of the map file and the
 source code that turns them into the entry, so an entry never goes stale: a changed file or another version
 of the package has another key.
 
-An entry is a pickle behind a header with its length and checksum. Pickle, because it is as fast as raw
-arrays here and keeps the types as they are; and harmless, because `_Unpickler` builds arrays, plain
-containers and the records of `limsim_jax.maps`, and nothing else.
+An entry is a pickle behind a header with its length and checksum. A pickle is as fast as raw arrays here
+and keeps the types. It is harmless, because `_Unpickler` builds only arrays, plain containers and the
+records of `limsim_jax.maps`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MAX_BYTES = 2 << 30
 """The directory is pruned to this size, least recently used entries first."""
 
 MAX_AGE = 90 * 24 * 3600.0
-"""Entries that were not used for so long (s) are removed."""
+"""Entries that were not used for this long (s) are removed."""
 
 _HEADER = struct.Struct("<8sQI")  # magic, payload length, CRC-32 of the payload
 _MAGIC = b"limsimjx"
@@ -47,7 +47,10 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def key(kind: str, *parts: str) -> str:
-    """File name of the entry of this kind for these parts (hashes, names, options)."""
+    """File name of an entry.
+
+    `parts` are hashes, names and options on which its content depends.
+    """
     digest = hashlib.sha256(_fingerprint())
     for part in parts:
         digest.update(struct.pack("<Q", len(part.encode())) + part.encode())
@@ -55,7 +58,10 @@ def key(kind: str, *parts: str) -> str:
 
 
 def load(name: str) -> Any | None:
-    """The entry, or None if there is none that can be used. A damaged one is logged and removed."""
+    """The entry, or None if there is none that can be used.
+
+    A damaged one is logged and removed.
+    """
     try:
         path = cache_directory() / name
         data = path.read_bytes()
@@ -74,7 +80,7 @@ def load(name: str) -> Any | None:
 
 
 def store(name: str, value: Any) -> None:
-    """Write an entry, all of it or nothing. Where that is not possible, say so once and go on."""
+    """Write an entry whole. A failure is logged once and ignored."""
     try:
         folder = cache_directory()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -106,12 +112,15 @@ def _decode(data: bytes) -> Any:
     payload = memoryview(data)[_HEADER.size :]
     if magic != _MAGIC or length != len(payload) or checksum != zlib.crc32(payload):
         raise ValueError("truncated or changed")
-    with no_garbage_collection():  # it would walk the growing heap again and again: half of the time
+    with no_garbage_collection():
         return _Unpickler(io.BytesIO(payload)).load()
 
 
 class _Pickler(pickle.Pickler):
-    """Writes members of enumerations by value; Python 3.11.0 to 3.11.3 would ask for `getattr`."""
+    """Writes members of enumerations by value.
+
+    Python 3.11.0 to 3.11.3 would need `getattr` to load them otherwise.
+    """
 
     def reducer_override(self, obj: Any, /) -> Any:
         if isinstance(obj, enum.Enum):
@@ -120,7 +129,7 @@ class _Pickler(pickle.Pickler):
 
 
 class _Unpickler(pickle.Unpickler):
-    """Builds arrays, plain containers and the records of `limsim_jax.maps`, and nothing else."""
+    """Builds only arrays, plain containers and records of `limsim_jax.maps`."""
 
     def find_class(self, module_name: str, global_name: str, /) -> Any:
         if (module_name, global_name) in _PLAIN:
@@ -140,7 +149,7 @@ _NUMPY = {"_frombuffer", "_reconstruct", "scalar"}  # how NumPy pickles arrays a
 
 @functools.cache
 def _fingerprint() -> bytes:
-    """Hash of all that shapes an entry besides the map file: our source and the versions beneath it."""
+    """Hash of our source code and of the versions below it."""
     versions = (platform.python_version_tuple()[:2], np.__version__, shapely.__version__)
     digest = hashlib.sha256(repr(versions).encode())
     for path in sorted([*_PACKAGE.glob("maps/**/*.py"), *_PACKAGE.glob("*.py")]):
@@ -149,7 +158,7 @@ def _fingerprint() -> bytes:
 
 
 def _prune(folder: Path) -> None:
-    """Remove entries that are old or too much, and what writers that died have left."""
+    """Remove old entries, those beyond `MAX_BYTES`, and leftovers of dead writers."""
     files = []
     for path in folder.iterdir():
         with contextlib.suppress(OSError):  # another process may prune, too

@@ -1,4 +1,4 @@
-"""Does a network hang together? What a person should look at before trusting a map."""
+"""Checks of a network: gaps, kinks, and circles of right of way."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ class Seam:
 
 
 def seams(network: Network, *, gap: float = GAP, kink: float = KINK) -> Iterator[Seam]:
-    """Links between drivable lanes that jump by more than `gap` (m) or `kink` (rad), in file order."""
+    """Links between drivable lanes that jump, in file order.
+
+    Those of more than `gap` (m) or `kink` (rad) count.
+    """
     for before in network.drivable_lanes():
         for after in (network.lanes[name] for name in before.successors):
             seam = _seam(before, after)
@@ -43,7 +46,7 @@ def seams(network: Network, *, gap: float = GAP, kink: float = KINK) -> Iterator
 
 
 def deadlocks(network: Network) -> list[list[str]]:
-    """Circles of right of way in which everyone yields to the next, as lane ids: see `priority_cycles`."""
+    """Circles of right of way, as lane ids: see `priority_cycles`."""
     from limsim_jax.maps.conflicts import build_conflicts, connectors, priority_cycles
     from limsim_jax.maps.lane_map import lane_rows
 

@@ -1,7 +1,7 @@
-"""Road network on the host: exact, ragged, float64, the same type from every reader.
+"""Road network on the host, the same type from every reader.
 
-A `Network` is what a map file says, in one vocabulary. Readers build it, `lane_map` turns it into
-device arrays, `draw` shows it. Nothing here touches JAX.
+Exact, in float64 and of ragged sizes. A `Network` holds what a map file states, in one vocabulary.
+Readers build it, `rasterise` turns it into device arrays, `report.draw` shows it. Nothing here uses JAX.
 
 Conventions: SI units, radians counter-clockwise, right-handed x east / y north. Every lane runs in
 its travel direction: `s = 0` is where traffic enters it, `left` is the driver's left.
@@ -24,7 +24,10 @@ Array = NDArray[np.float64]
 
 
 class MapError(ValueError):
-    """A map that cannot be used. One line: file, line, element, reason and, if known, the mend."""
+    """A map that cannot be used.
+
+    One line: file, line, element, reason and, if known, the remedy.
+    """
 
     def __init__(
         self,
@@ -43,7 +46,7 @@ class MapError(ValueError):
 
 
 def _one_line(text: str, longest: int = 500) -> str:
-    """The text without line breaks, and without its middle where it is very long."""
+    """The text without line breaks, shortened where it is very long."""
     text = " ".join(text.split())
     return text if len(text) <= longest else f"{text[: longest // 2]} ... {text[-longest // 4 :]}"
 
@@ -53,12 +56,12 @@ def _rebuild_map_error(reason: str, file: Any, line: Any, element: Any) -> MapEr
 
 
 class Action(enum.StrEnum):
-    """What became of something in the file."""
+    """How a reader treated an element of the file."""
 
     READ = "read"  # taken over exactly
     APPROXIMATED = "approximated"  # taken over, but not exactly
     IGNORED = "ignored"  # not taken over
-    REPAIRED = "repaired"  # broken in the file, mended here
+    REPAIRED = "repaired"  # broken in the file, repaired here
     ADDED = "added"  # not in the file, and needed: made up here
 
 
@@ -67,7 +70,7 @@ class Note:
     """One line of the import report."""
 
     action: Action
-    element: str  # what it is: "lane", "signal", "laneSection", ...
+    element: str  # kind: "lane", "signal", "laneSection", ...
     where: str  # ids a person can search the file for: "road 12 section 0 lane -1"
     message: str
     line: int | None = None
@@ -79,7 +82,10 @@ class Note:
 
 @dataclass
 class ImportReport:
-    """What a reader did with every element: counts per element and action, and a note for all but READ."""
+    """What a reader did with every element.
+
+    It has counts per element and action, and a note for every action but READ.
+    """
 
     counts: Counter[tuple[str, Action]] = field(default_factory=Counter)
     notes: list[Note] = field(default_factory=list)
@@ -96,15 +102,15 @@ class ImportReport:
     def ignored(
         self, element: str, where: str, message: str, line: int | None = None, *, count: int = 1
     ) -> None:
-        """Record an element that was not taken over, or with `count` several alike in one note."""
+        """Record an element that was not taken over, or `count` equal ones."""
         self._note(Action.IGNORED, element, where, message, line, count)
 
     def repaired(self, element: str, where: str, message: str, line: int | None = None) -> None:
-        """Record an element that is broken in the file and was mended."""
+        """Record an element that is broken in the file and was repaired."""
         self._note(Action.REPAIRED, element, where, message, line)
 
     def added(self, element: str, where: str, message: str, line: int | None = None) -> None:
-        """Record something needed that the file does not have and that was made up."""
+        """Record something that is needed, missing in the file and made up."""
         self._note(Action.ADDED, element, where, message, line)
 
     def _note(
@@ -209,7 +215,7 @@ class Control(enum.StrEnum):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lane:
-    """A stretch of lane on which type, limit, neighbours and permissions do not change.
+    """A stretch of lane with constant type, limit, neighbours and permissions.
 
     The centre line is sampled so finely that cubic Hermite interpolation (`pose`) is within 0.1 mm
     of the curve that the file defines. Samples are ascending in `s`; a kink is two samples 1 mm apart.
@@ -240,7 +246,7 @@ class Lane:
 
     @property
     def carriageway(self) -> tuple[str, int, bool]:
-        """Lanes with the same key lie side by side in the same direction."""
+        """Key of the lanes side by side in the same direction."""
         return self.road, self.section, self.number < 0
 
     @property
@@ -250,11 +256,14 @@ class Lane:
 
     @property
     def drivable(self) -> bool:
-        """Whether motor traffic runs on it."""
+        """Whether it is for motor traffic."""
         return self.type in DRIVABLE and bool(self.access & MOTOR_CLASSES)
 
     def pose(self, s: Any) -> tuple[Array, Array]:
-        """Centre-line position `[..., 3]` (m) and heading `[...]` (rad) at arc length `s` (m, clipped)."""
+        """Position `[..., 3]` (m) and heading `[...]` (rad) at arc length `s`.
+
+        `s` is in m and clipped to the lane.
+        """
         s = np.clip(np.asarray(s, float), 0.0, self.length)
         i = np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
         h = self.s[i + 1] - self.s[i]
@@ -286,9 +295,10 @@ class Lane:
 
 @dataclass(frozen=True, kw_only=True)
 class Movement:
-    """A way across a junction: leave `incoming`, follow the `via` connectors in order, enter `outgoing`.
+    """A way across a junction.
 
-    `via` is empty where the lanes meet directly (direct junctions, SUMO nets without internal lanes).
+    It leaves `incoming`, follows the `via` connectors in order and enters `outgoing`. `via` is empty
+    where the lanes meet directly (direct junctions, SUMO nets without internal lanes).
     """
 
     index: int  # position in `Network.movements`
@@ -300,8 +310,8 @@ class Movement:
     control: Control = Control.NONE
     program: str | None = None  # signal program that controls it
     link: int | None = None  # its place in the state strings of that program
-    yields_to: frozenset[int] = frozenset()  # movements that the file says go first
-    foes: frozenset[int] = frozenset()  # movements that the file says cross or merge with it
+    yields_to: frozenset[int] = frozenset()  # movements to which the file gives priority
+    foes: frozenset[int] = frozenset()  # movements that cross it or merge with it, says the file
     waits_inside: bool = False  # may enter the junction and wait there for its foes (SUMO `cont`)
     keep_clear: bool = True  # must not enter unless it can leave (SUMO `keepClear`)
 
@@ -426,7 +436,7 @@ class Road:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Network:
-    """Everything a map file says about its roads."""
+    """All that a map file states about its roads."""
 
     name: str
     source: str  # path of the file
@@ -460,7 +470,7 @@ class Network:
     def lane_at(self, road: str, number: int, road_s: float) -> Lane:
         """The lane with this number at a road coordinate (m). Raises `MapError` if there is none.
 
-        On the border of two lanes the later one answers, as OpenDRIVE has it.
+        On the border of two lanes it is the later one, as in OpenDRIVE.
         """
         spans = [
             (min(lane.road_s[0], lane.road_s[-1]), max(lane.road_s[0], lane.road_s[-1]), lane)

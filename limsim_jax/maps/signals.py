@@ -1,4 +1,4 @@
-"""Traffic signals: programs as arrays, the phase at a time, and programs for lights without timing.
+"""Traffic signals: programs, phases, and plans for lights without timing.
 
 Programs follow SUMO: a phase is a duration and one letter per link; a positive offset starts the
 cycle that much later. OpenDRIVE says where lights stand and which of them switch together, but not
@@ -56,7 +56,10 @@ LATERAL = 3.0
 
 
 class SignalState(enum.IntEnum):
-    """What a light shows to one link. The comments give the letter in SUMO's state strings."""
+    """What a light shows to one link.
+
+    The comments give the letter in SUMO's state strings.
+    """
 
     RED = 0  # r
     YELLOW = 1  # y
@@ -73,9 +76,10 @@ _LETTERS = dict(zip("rygGusoO", SignalState, strict=True))
 
 @flax.struct.dataclass(kw_only=True)
 class SignalTable:
-    """Signal programs: `G - 1` programs and, last, one that is off; `P` phases, `S` links each.
+    """Signal programs as arrays.
 
-    Lanes and movements without a light have program -1 and link -1, which read as `OFF`.
+    There are `G - 1` programs and, last, one that is off, with `P` phases and `S` links each. Lanes and
+    movements without a light have program -1 and link -1, which read as `OFF`.
     """
 
     duration: Float[Array, "G P"]  # s, 0 beyond the last phase
@@ -93,7 +97,10 @@ class SignalTable:
     movement_link: Int[Array, " M"]
 
     def pad(self, *, programs: int, phases: int, links: int, lanes: int, movements: int) -> SignalTable:
-        """The same table with these sizes, null rows included. Raises `ValueError` if it does not fit."""
+        """The same table with these sizes, null rows included.
+
+        Raises `ValueError` if it does not fit.
+        """
         sizes = {"G": programs, "P": phases, "S": links, "L": lanes, "M": movements}
         off = {"duration": 1.0, "min_duration": 1.0, "max_duration": 1.0, "state": SignalState.OFF}
         off |= {"cycle": 1.0, "num_phases": 1}
@@ -121,10 +128,10 @@ class SignalTable:
 
 
 def build_signals(network: Network, rows: Mapping[str, int]) -> SignalTable:
-    """Arrays of all signal programs, and the light of every lane and movement.
+    """Build the arrays of all signal programs.
 
     Where movements with different lights begin on the same connector, `lane_link` has the first of
-    them and `movement_link` tells them apart. Movements that cross no connector have no lane of their
+    them and `movement_link` distinguishes them. Movements that cross no connector have no lane of their
     own and are only found by movement.
 
     Raises:
@@ -205,10 +212,10 @@ def _check(network: Network, program: Program) -> None:
 
 
 def phase_at(table: SignalTable, t: Float[Array, ""] | float) -> Int[Array, " G"]:
-    """Phase of every program at time `t` (s since the start), run with fixed durations.
+    """Phase of every program at time `t` (s since the start).
 
     As in SUMO, the cycle starts at `t = offset`. A phase includes its first moment, not its last.
-    Actuated programs, too, run their nominal durations here; who extends them keeps their phase.
+    Actuated programs run their nominal durations here, too. An actuated controller has to keep its own phase.
     """
     into = jnp.mod(jnp.asarray(t, jnp.float32) - table.offset, table.cycle)
     ends = jnp.cumsum(jnp.asarray(table.duration), axis=-1)
@@ -217,13 +224,13 @@ def phase_at(table: SignalTable, t: Float[Array, ""] | float) -> Int[Array, " G"
 
 
 def lane_states(table: SignalTable, phase: Int[Array, " G"]) -> Int[Array, " L"]:
-    """What the light at the entry of every lane shows (`SignalState`) in these phases of the programs."""
+    """The `SignalState` at the entry of every lane in these phases."""
     program = jnp.asarray(table.lane_program)
     return jnp.asarray(table.state)[program, jnp.asarray(phase)[program], table.lane_link]
 
 
 def movement_states(table: SignalTable, phase: Int[Array, " G"]) -> Int[Array, " M"]:
-    """What the light of every movement shows (`SignalState`) in these phases of the programs."""
+    """The `SignalState` of every movement in these phases."""
     program = jnp.asarray(table.movement_program)
     return jnp.asarray(table.state)[program, jnp.asarray(phase)[program], table.movement_link]
 
@@ -232,18 +239,20 @@ def movement_states(table: SignalTable, phase: Int[Array, " G"]) -> Int[Array, "
 
 
 def yellow_time(speed: float) -> float:
-    """Yellow time (s) for an approach speed (m/s): `t + v / (2 a)`, within 3 to 6 s, rounded up to 0.1 s.
+    """Yellow time (s) for an approach speed (m/s): `t + v / (2 a)`.
 
-    The kinematic equation on level ground, with t = 1 s and a = 3 m/s2 (Gazis, Herman and Maradudin
-    1960; ITE, Guidelines for Determining Traffic Signal Change and Clearance Intervals, 2020).
+    Within 3 to 6 s, rounded up to 0.1 s. The kinematic equation on level ground, with t = 1 s and
+    a = 3 m/s^2 (Gazis, Herman and Maradudin 1960; ITE, Guidelines for Determining Traffic Signal Change and
+    Clearance Intervals, 2020).
     """
     return _round_up(min(6.0, max(3.0, REACTION + speed / (2 * DECELERATION))))
 
 
 def all_red_time(distance: float, speed: float) -> float:
-    """All-red time (s) to drive `distance` (m) and clear it by a vehicle's length: `(w + L) / v`.
+    """All-red time (s) to clear `distance` (m): `(w + L) / v`.
 
-    Within 1 to 6 s, rounded up to 0.1 s. Source as for `yellow_time`; L = 5 m.
+    `L` = 5 m is the length of a vehicle. Within 1 to 6 s, rounded up to 0.1 s. Source as for
+    `yellow_time`.
     """
     return _round_up(min(6.0, max(1.0, (distance + VEHICLE_LENGTH) / max(speed, 1.0))))
 
@@ -253,7 +262,7 @@ def _round_up(seconds: float) -> float:
 
 
 def generate_programs(network: Network, *, green: float = GREEN, green_turn: float = GREEN_TURN) -> Network:
-    """The network with a program for every junction whose lights have no timing in the file.
+    """Add a program for every junction whose lights have no timing.
 
     A movement is signalised if a traffic light stands for one of its connectors or for its incoming
     lane (an arrow light: for its turn); movements that already have a program keep it. Every
@@ -261,16 +270,15 @@ def generate_programs(network: Network, *, green: float = GREEN, green_turn: flo
 
     - Units switch together: the movements of a controller, or where there is none (or where it
       would show green to crossing traffic) those of an approach with the same arrow or none. Lanes
-      that only turn across the opposite direction are a unit of their own if they have somebody to
-      yield to.
+      that only turn across the opposite direction are a unit of their own if they have to yield.
     - Stages are sets of units that do not conflict. Turns across the opposite direction share its
       stage and yield, unless they are a unit of their own, which is then protected and comes before
-      the rest of its approach. U-turns yield to everybody. A unit is green in every stage in which
-      nothing speaks against it.
-    - A stage is green for `green` s (`green_turn` s if it has turns only). What is red in the next
-      one is then yellow (`yellow_time` at the fastest approach) and red (`all_red_time` over the
+      the rest of its approach. U-turns yield to all others. A unit is green in every stage with
+      which it is compatible.
+    - A stage is green for `green` s (`green_turn` s if it has turns only). A movement that is red in
+      the next one is then yellow (`yellow_time` at the fastest approach) and red (`all_red_time` over the
       longest way to the end of the last conflict, at the speed limit or that of the turn).
-    - Green is major where nobody else who is green goes first, else minor.
+    - Green is major where no other green movement goes first, otherwise minor.
     - A junction with a single stage alternates with 10 s of red.
 
     Notes: one `added` per program, one `ignored` per light that governs no movement.
@@ -316,7 +324,10 @@ def generate_programs(network: Network, *, green: float = GREEN, green_turn: flo
 
 
 def _lights_of(movement: Movement, lights: Mapping[str, Sequence[TrafficLight]]) -> list[TrafficLight]:
-    """The lights for a movement: those over its connectors, else over its incoming lane; arrows first."""
+    """The lights for a movement, arrows first.
+
+    They stand over its connectors or, if there are none, over its incoming lane.
+    """
     for names in (movement.via, (movement.incoming,)):
         over = [light for name in names for light in lights.get(name, ())]
         arrows = [light for light in over if movement.turn in light.turns]
@@ -332,7 +343,7 @@ def _free_id(junction: str, taken: Set[str] | Mapping[str, object]) -> str:
 
 @dataclass(frozen=True)
 class _Meeting:
-    """How a movement meets another: whether it yields or may have to, and where it is past it."""
+    """How a movement meets another, and where it has passed it."""
 
     yields: bool
     clear: float  # m from its entry into the junction
@@ -413,7 +424,7 @@ class _Planner:
         return sorted(units, key=lambda unit: order[unit[0].index])
 
     def _split(self, approach: list[Movement], members: Sequence[Movement]) -> list[list[Movement]]:
-        """Set apart the lanes of an approach that only turn across oncoming traffic, if there is any."""
+        """Set apart lanes that only turn across oncoming traffic."""
         lanes: dict[str, list[Movement]] = defaultdict(list)
         for movement in approach:
             lanes[movement.incoming].append(movement)
@@ -423,7 +434,10 @@ class _Planner:
         return [turning, rest] if turning and rest and oncoming else [approach]
 
     def _compatible(self, unit: Sequence[Movement], other: Sequence[Movement], protect: bool) -> bool:
-        """Whether two units may be green together; `protect`: one of them must meet nobody."""
+        """Whether two units may be green together.
+
+        `protect`: one of them must not meet any movement.
+        """
         return not any(
             self._hard(a, b) or (protect and self._permissive(a, b) and self._road(a) != self._road(b))
             for a in unit
@@ -440,7 +454,7 @@ class _Planner:
         return not (self._road(one) == self._road(two) or self._permissive(one, two))
 
     def _permissive(self, one: Movement, two: Movement) -> bool:
-        """Whether two movements meet, but one of them may wait inside for a gap."""
+        """Whether of two movements that meet one may wait inside."""
         if (one.index, two.index) not in self.meetings:
             return False
         if Turn.U_TURN in (one.turn, two.turn):

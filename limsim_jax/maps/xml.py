@@ -1,7 +1,7 @@
-"""The XML reader of all map and scenario files: bounded, typed, and every fault a `MapError`.
+"""The XML reader of all map and scenario files.
 
-Files may come from anywhere. The parser resolves no entities, opens no other file and no network, and
-libxml2 bounds depth, attribute size and entity expansion.
+Files may come from any source. The parser resolves no entities and opens no other file and no network.
+libxml2 bounds depth, attribute size and entity expansion. Every fault is a `MapError`.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def root_name(data: bytes, path: str | Path) -> str:
 
 
 def describe(element: Element) -> str:
-    """The element by its tag and id, within its ancestors that have ids."""
+    """Tag and id of an element and of its ancestors with ids."""
     chain = [element, *element.iterancestors()]
     parts = [
         f"{e.tag} {e.get('id')}" if e.get("id") is not None else str(e.tag)
@@ -96,7 +96,7 @@ def describe(element: Element) -> str:
 
 
 class Ignored:
-    """What a reader leaves out, by kind: how many, and the first place."""
+    """What a reader leaves out: a count and the first place per kind."""
 
     def __init__(self) -> None:
         self._count: Counter[tuple[str, str]] = Counter()
@@ -116,7 +116,7 @@ class Ignored:
 
 
 class _Source:
-    """Bytes as a stream, so that the parser never holds more than one top-level element."""
+    """Bytes as a stream, for a parser that holds one top-level element."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._at = memoryview(data), 0
@@ -128,7 +128,7 @@ class _Source:
 
 
 class XmlReader:
-    """Elements of one file, typed access to their attributes, and what is left out of them.
+    """Typed access to the elements and attributes of one file.
 
     All methods that read an attribute take its name, strip white space around its value and raise
     `MapError` if it is missing and there is no default.
@@ -156,9 +156,9 @@ class XmlReader:
         return root
 
     def children(self, data: bytes, *roots: str) -> Iterator[tuple[Element, Element]]:
-        """Yield `(root, child)` for every child of the root element, then drop the child.
+        """Yield `(root, child)` for every child of the root element.
 
-        For files of any size. Raises `MapError` where `parse` does.
+        A child is dropped after use. For files of any size. Raises `MapError` where `parse` does.
         """
         try:
             events = etree.iterparse(
@@ -239,7 +239,10 @@ class XmlReader:
         return default
 
     def parse_number(self, element: Element, name: str, value: str, minimum: float = -math.inf) -> float:
-        """`value`, a part of attribute `name`, as a finite number not below `minimum`."""
+        """`value`, a part of attribute `name`, as a finite number.
+
+        Raises `MapError` if it is none or below `minimum`.
+        """
         try:
             number = float(value)
         except ValueError:
@@ -295,10 +298,10 @@ class XmlReader:
             raise self.error(element, f"<{path}> is '{text.strip()[:40]}', not a finite number")
         return value
 
-    # --- what is left out -----------------------------------------------------------------------
+    # --- elements and attributes that are left out ----------------------------------------------
 
     def unasked(self, element: Element) -> dict[str, str]:
-        """Attributes of an element that nothing asked for so far, as they stand."""
+        """Attributes of an element that were not read so far, unchanged."""
         asked = self._asked[element.tag]
         return {name: value for name, value in element.attrib.items() if name not in asked}
 
@@ -314,7 +317,7 @@ class XmlReader:
                 self.ignore(child, f"not used within <{element.tag}>")
 
     def ignore_unasked(self, element: Element) -> None:
-        """Count the attributes that nothing asked for; call it after reading the element."""
+        """Count the attributes that were not read. Call it after reading."""
         for name in self.unasked(element):
             if not name.startswith("{"):
                 kind, where = f"{element.tag}@{name}", describe(element)

@@ -79,7 +79,7 @@ class Curve:
         self.length = round(sum(p.length for p in self.pieces), 6)
 
     def records(self) -> Iterator[tuple[float, Pose, Piece]]:
-        """Where along the curve each piece starts, its first pose, and the piece."""
+        """Start along the curve, first pose and piece, for each piece."""
         s, pose = 0.0, self.start
         for piece in self.pieces:
             yield round(s, 6), pose, piece
@@ -130,9 +130,10 @@ def arc(radius: float, degrees: float, clothoid: float) -> list[Piece]:
 
 
 def bend(angle: float, tangent: float) -> list[Piece]:
-    """The clothoid-arc-clothoid turn by `angle` whose legs to the corner are `tangent` long.
+    """A clothoid-arc-clothoid turn by `angle`.
 
-    A quarter of the angle falls to the clothoids. All such turns are similar: the unit one is scaled.
+    Its legs to the corner are `tangent` long. A quarter of the angle falls to the clothoids. All such
+    turns are similar: the unit one is scaled.
     """
     if abs(angle) < 1e-9:
         return [Piece(2 * tangent)]
@@ -144,7 +145,10 @@ def bend(angle: float, tangent: float) -> list[Piece]:
 
 
 def join(a: Pose, b: Pose) -> Curve:
-    """A smooth curve from `a` to `b`: one bend if the legs allow it, else two of opposite sense."""
+    """A smooth curve from `a` to `b`.
+
+    It has one bend if the legs allow it, otherwise two of opposite sense.
+    """
     ahead, left = a.local(b)
     angle = wrap(b.heading - a.heading)
     if abs(math.sin(angle)) > 1e-6:
@@ -162,13 +166,13 @@ def join(a: Pose, b: Pose) -> Curve:
 
 
 class Profile:
-    """A quantity along a road: constant, then smoothsteps from knot to knot, then constant."""
+    """A quantity along a road: smoothsteps between knots, constant outside."""
 
     def __init__(self, *knots: tuple[float, float]) -> None:
         self.knots = tuple((round(s, 6), v) for s, v in knots)
 
     def cubic(self, s: float) -> tuple[float, float, float, float]:
-        """Coefficients of the cubic in (ds from `s`) that holds from `s` on."""
+        """Coefficients in ds of the cubic that holds from `s` on."""
         for (s0, v0), (s1, v1) in zip(self.knots, self.knots[1:], strict=False):
             if s0 <= s < s1:
                 length, rise, u = s1 - s0, v1 - v0, (s - s0) / (s1 - s0)
@@ -185,7 +189,7 @@ class Profile:
         return self.cubic(s)[0]
 
     def records(self, s0: float, s1: float) -> Iterator[tuple[float, tuple[float, float, float, float]]]:
-        """(s, cubic) from `s0` up to `s1`, without records that only repeat a constant."""
+        """(s, cubic) from `s0` up to `s1`, without repeated constants."""
         last = None
         for s in [s0, *(k for k, _ in self.knots if s0 < k < s1)]:
             cubic = self.cubic(s)
@@ -194,7 +198,7 @@ class Profile:
             last = cubic
 
     def narrow_at(self) -> float | None:
-        """Where a lane that opens or closes passes `NARROWEST`, rounded to where it is wider."""
+        """Place where a width passes `NARROWEST`, on its wider side."""
         for (s0, v0), (s1, v1) in zip(self.knots, self.knots[1:], strict=False):
             if (v0 == 0) != (v1 == 0):
                 u = 0.5 - math.sin(math.asin(1 - 2 * NARROWEST / max(v0, v1)) / 3)

@@ -1,4 +1,4 @@
-"""Junctions and maps in the making, and the things that stand on their roads."""
+"""Junctions and maps in the making, with the furniture of their roads."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class Junction:
         between: str = "none",
         outside: str = "solid",
     ) -> Road:
-        """Connect lanes of `source` with lanes of `target`, both listed from the left.
+        """Connect lanes of `source` with lanes of `target`.
 
-        `None` stands for a lane that is not there on that side: it opens or closes on the way.
-        `curve` is the reference line where both roads share one; else it is the left edge. Only roads
-        with a `curve` are marked: `between` lanes and on the `outside`.
+        Both are listed from the left. `None` stands for a lane that is not there on that side: it opens
+        or closes on the way. `curve` is the reference line where both roads share one; otherwise it is
+        the left edge. Only roads with a `curve` are marked: `between` lanes and on the `outside`.
         """
         self.map.attach(source, self)
         self.map.attach(target, self)
@@ -96,7 +96,10 @@ class Junction:
 
 
 class Map:
-    """A map in the making. Roads are numbered from 1, junctions 100, 200, ..., their roads from 101."""
+    """A map in the making.
+
+    Roads are numbered from 1, junctions 100, 200, ..., their roads from 101.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -151,7 +154,10 @@ class Map:
     # ------------------------------------------------------------------------- things on the road
 
     def signal(self, contact: Contact, back: float, lanes: Sequence[str], t: float, **attributes: str) -> int:
-        """Add a signal for traffic that leaves the road at `contact`, `back` metres before it does."""
+        """Add a signal for traffic that leaves the road at `contact`.
+
+        It stands `back` metres before that end.
+        """
         at_end = contact.at == "end"
         number = self.new_id()
         element = etree.Element("signal", id=str(number))
@@ -186,7 +192,7 @@ class Map:
         )
 
     def sign(self, contact: Contact, back: float, lanes: Sequence[str], kind: str, **attributes: str) -> None:
-        """A sign to the right of the road, for traffic that leaves at `contact`."""
+        """A sign to the right of traffic that leaves at `contact`."""
         number = contact.leaving([lanes[-1]])[0]
         t = contact.t(number, 1.0)
         attributes |= {"type": kind, "height": "0.6", "width": "0.6"}
@@ -206,7 +212,7 @@ class Map:
         lanes: Sequence[int],
         **attributes: str,
     ) -> None:
-        """Paint a rectangle across the road: `depth` along it, from `t0` to `t1`."""
+        """Paint a rectangle, `depth` along the road and from `t0` to `t1`."""
         half_u, half_v = depth / 2, abs(t1 - t0) / 2
         element = etree.Element("object", id=str(self.new_id()))
         sizes = {"length": depth, "width": 2 * half_v, "height": 0.0, "hdg": 0.0, "pitch": 0.0, "roll": 0.0}
@@ -221,7 +227,7 @@ class Map:
         road.objects.append(element)
 
     def stop_line(self, contact: Contact, back: float, lanes: Sequence[str]) -> None:
-        """A stop line half a metre deep; traffic stops `back` metres before the end of the road."""
+        """A stop line, `back` metres before the end of the road."""
         numbers = contact.leaving(lanes)
         s = contact.s - back + 0.25 if contact.at == "end" else back - 0.25
         self.flat_object(
@@ -238,7 +244,10 @@ class Map:
         )
 
     def crosswalk(self, contact: Contact, back: float) -> None:
-        """A crosswalk 4 m wide over all driving lanes, whose far edge is `back` metres from the end."""
+        """A crosswalk 4 m wide over all driving lanes.
+
+        Its far edge is `back` metres from the end.
+        """
         numbers = [
             sign * (i + 1)
             for sign, side in ((-1, contact.section.right), (1, contact.section.left))

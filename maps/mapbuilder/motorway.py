@@ -32,7 +32,10 @@ def expressway(
     offset: float = 0.0,
     height: Profile | float = 0.0,
 ) -> Road:
-    """A one-way carriageway with three lanes; auxiliary lanes of these lengths at its start and end."""
+    """A one-way carriageway with three lanes.
+
+    `accelerate` and `decelerate`: lengths of auxiliary lanes at its start and end.
+    """
 
     def lanes(key: str, width: Profile) -> list[Lane]:
         return [*FAST, Lane(key, width, speed=100), HARD]
@@ -55,7 +58,7 @@ def opposite(m: Map, name: str, base: Curve, height: Profile | float = 0.0) -> R
 
 
 def to_ramp() -> float:
-    """From the reference line of an expressway to the edge strip of a ramp at its nose."""
+    """Distance from the reference line to a ramp nose."""
     return sum(lane.profile()(0) for lane in FAST) + GORE - RAMP[0].profile()(0)
 
 

@@ -19,7 +19,10 @@ Mark = str | tuple[tuple[float, str], ...]
 
 
 class Lane(NamedTuple):
-    """A lane of a section. `key` tells which lane it continues at section borders and links."""
+    """A lane of a section.
+
+    At section borders and links it continues the lane of the same `key`.
+    """
 
     key: str
     width: float | Profile
@@ -33,7 +36,7 @@ class Lane(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A lane section from `s` on; lanes are listed from the reference line outwards."""
+    """A lane section from `s` on, lanes from the reference line outwards."""
 
     s: float
     right: Sequence[Lane]
@@ -43,7 +46,7 @@ class Section(NamedTuple):
 
 @dataclass(eq=False)
 class Road:
-    """A road; `ends` says what lies before its start and beyond its end."""
+    """A road; `ends` has its neighbours at both ends."""
 
     id: int
     name: str
@@ -60,7 +63,7 @@ class Road:
     signals: list[etree._Element] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        """Split sections where a driving lane that opens or closes becomes too narrow."""
+        """Split sections where a driving lane becomes too narrow."""
         split = []
         for i, section in enumerate(self.sections):
             end = self.sections[i + 1].s if i + 1 < len(self.sections) else self.curve.length
@@ -105,7 +108,7 @@ class Contact(NamedTuple):
         return self._numbers(keys, right=self.at == "start")
 
     def keys(self, *, leaving: bool, kind: str = "driving") -> list[str]:
-        """Lanes of a kind whose traffic leaves (or enters) the road here, from the left."""
+        """Lanes that leave or enter the road here, from the left."""
         right = leaving == (self.at == "end")
         lanes = self.section.right if right else self.section.left
         return [lane.key for lane in lanes if lane.kind == kind]
@@ -126,13 +129,16 @@ class Contact(NamedTuple):
         return self.lane(number).profile()(self.s)
 
     def t(self, number: int, across: float = 0.0) -> float:
-        """Lateral coordinate in a lane, from its inner (0) to its outer border (1)."""
+        """Lateral coordinate between the borders of a lane.
+
+        `across` is 0 at the inner and 1 at the outer border.
+        """
         inner = sum(self.width(int(math.copysign(i, number))) for i in range(1, abs(number)))
         t = inner + across * self.width(number)
         return self.road.offset(self.s) + math.copysign(t, number)
 
     def left_edge(self, number: int) -> Pose:
-        """The inner border of a lane, which is on the left of its traffic, headed as it drives."""
+        """Pose on a lane's inner border, in its direction of travel."""
         pose = self.road.curve.pose(self.s).move(left=self.t(number))
         return pose if number < 0 else pose.move(turn=math.pi)
 

@@ -24,7 +24,10 @@ def walk(width: float = 2.5) -> Lane:
 
 
 def inwards(start: Pose, pieces: Sequence[Piece]) -> Curve:
-    """A curve towards an intersection, described outwards from it. `start` looks inwards."""
+    """A curve towards an intersection, described outwards from it.
+
+    `start` looks inwards.
+    """
     return Curve(start.move(turn=math.pi), pieces).reversed()
 
 
@@ -36,7 +39,7 @@ def mirrored(profile: Profile | float, length: float) -> Profile | float:
 
 
 class Arm(NamedTuple):
-    """An arm of an intersection: the end where traffic enters it and the one where it leaves."""
+    """An arm of an intersection: the road ends that enter and leave it."""
 
     enter: Contact | None
     leave: Contact | None
@@ -45,10 +48,10 @@ class Arm(NamedTuple):
 def approach(
     m: Map, name: str, curve: Curve, *, right_turn: float, far: float, height: Profile | float
 ) -> Road:
-    """A one-way carriageway towards an intersection, where a left-turn pocket opens in the median.
+    """A one-way carriageway with a left-turn pocket before an intersection.
 
-    The reference line is the left edge of the pocket. `far` is the width of the median to its right
-    at the far end. With `right_turn` (width) a right lane opens too.
+    The pocket opens in the median. The reference line is the left edge of the pocket. `far` is the width
+    of the median to its right at the far end. With `right_turn` (width) a right lane opens too.
     """
     length = curve.length
     s0, s1, s2 = 60.0, length - STORAGE - TAPER, length - STORAGE
@@ -85,7 +88,7 @@ def main_arm(
     far: float = 0.0,
     height: Profile | float = 0.0,
 ) -> Arm:
-    """A dual carriageway with two lanes each way that widens towards the intersection."""
+    """A dual carriageway, two lanes each way, that widens to an intersection."""
     towards = approach(m, f"{name} in", curve, right_turn=right_turn, far=far, height=height)
     away = departure(m, f"{name} out", curve.reversed(), far=far, height=mirrored(height, curve.length))
     return Arm(towards.end, away.start)
@@ -118,7 +121,10 @@ Moves = Sequence[tuple[str, Sequence[str], str, Sequence[str]]]
 
 
 def connect_all(junction: Junction, arms: dict[str, Arm], moves: Moves) -> dict[str, list[Road]]:
-    """Build movements (from arm, lanes, to arm, lanes); the connecting roads by arm they come from."""
+    """Build movements (from arm, lanes, to arm, lanes).
+
+    Returns the connecting roads by the arm they come from.
+    """
     made: dict[str, list[Road]] = {name: [] for name in arms}
     for a, lanes, b, onto in moves:
         source, target = arms[a].enter, arms[b].leave
@@ -138,9 +144,10 @@ def furnish(m: Map, arm: Arm, *, stop: bool = True) -> None:
 
 
 def signalised(m: Map, name: str, arms: dict[str, Arm], height: float = 0.0) -> None:
-    """An intersection with lights: main road W-E (left, t1, t2, perhaps right), minor road N-S (left, t1).
+    """A signalised intersection.
 
-    Four signal groups: main through and right, main left, minor through and right, minor left.
+    The main road W-E has lanes left, t1, t2 and perhaps right, the minor road N-S left and t1. Four
+    signal groups: main through and right, main left, minor through and right, minor left.
     """
     junction = m.junction(name, height)
     moves: list[tuple[str, Sequence[str], str, Sequence[str]]] = [
@@ -181,7 +188,7 @@ MOUTH_ANGLE = math.radians(35)  # a junction spans this much of the ring on both
 
 
 def ring_arm(m: Map, name: str, curve: Curve, height: Profile | float = 0.0) -> Arm:
-    """A two-way road with two lanes each way, whose median widens to a splitter island."""
+    """A two-way road whose median widens to a splitter island."""
     median = Lane("median", Profile((curve.length - 60.0, 1.0), (curve.length, SPLITTER)), "median")
     lanes_in = [median, Lane("in1", 3.25), Lane("in2", 3.5), walk(2.0)]
     lanes_out = [median, Lane("out1", 3.5), Lane("out2", 3.75), walk(2.0)]
@@ -192,9 +199,10 @@ def ring_arm(m: Map, name: str, curve: Curve, height: Profile | float = 0.0) -> 
 def roundabout(
     m: Map, name: str, centre: Pose, arms: Sequence[tuple[float, Arm]], height: float = 0.0
 ) -> None:
-    """A two-lane ring, one junction per arm; arms are (direction from the centre, arm), counter-clockwise.
+    """A two-lane ring with one junction per arm.
 
-    The right lane enters the outer ring lane and leaves from it, the left lane the inner one.
+    Arms are (direction from the centre, arm), counter-clockwise. The right lane enters the outer ring
+    lane and leaves from it, the left lane the inner one.
     """
 
     def ring_arc(a: float, b: float) -> Curve:

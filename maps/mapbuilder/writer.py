@@ -141,7 +141,7 @@ def lane_element(
 
 
 def linked_lane(road: Road, number: int, lane: Lane, at: str, other: int) -> int | None:
-    """The lane that continues this one beyond the start or end of its section."""
+    """Number of the lane that continues this one beyond its section."""
     if 0 <= other < len(road.sections):
         section = road.sections[other]
         keys = [n.key for n in (section.right if number < 0 else section.left)]

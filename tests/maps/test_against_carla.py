@@ -30,7 +30,7 @@ def compared(source: Path) -> referee.Comparison:
 
 
 def check(row: referee.Comparison, junctions_as_carla: bool = True) -> None:
-    """What every map has to show."""
+    """Requirements for every map."""
     figures = row.figures
     assert row.failure is None
     assert row.misses == []
@@ -69,7 +69,7 @@ def test_a_town_of_many_lanes(name: str = "carla_town03") -> None:
 
 @needs_shared
 def test_left_hand_traffic() -> None:
-    """CARLA's topology does not know left-hand traffic: the links of the file settle the movements."""
+    """CARLA's topology ignores left-hand traffic: the links of the file decide."""
     row = compared(SHARED / "opendrive" / "simple_3way_lht.xodr")
     check(row, junctions_as_carla=False)
     assert row.figures["movements"] == 6
@@ -163,7 +163,7 @@ def test_a_crash_of_the_parser_is_told(tmp_path: Path, sound: Path) -> None:
 
 @needs_shared
 def test_formulas_give_the_published_lengths() -> None:
-    """The referee's own formulas against figures that nobody here computed."""
+    """The referee's own formulas against published figures."""
     published = referee.published_lengths()
     assert len(published) > 30
     for name in (

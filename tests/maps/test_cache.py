@@ -196,7 +196,7 @@ def _compete(path, barrier, results):
 
 
 def test_competing_writers(file, folder):
-    """Many processes that load the same new map at once all get it, and one whole entry remains."""
+    """Many processes load the same new map; one whole entry remains."""
     lanes = len(read_network(file, cache=False).lanes)
     context = multiprocessing.get_context("spawn")
     barrier, results = context.Barrier(4), context.Queue()
@@ -213,7 +213,7 @@ def test_competing_writers(file, folder):
 
 @pytest.mark.parametrize("obstacle", ["a file", "below a file"])
 def test_unwritable_folder_is_said_once(obstacle, file, tmp_path, monkeypatch, caplog):
-    """(Not by permissions: these do not stop root.)"""
+    """Permissions would not stop root, so a file is in the way."""
     (tmp_path / "taken").write_text("not a folder")
     place = tmp_path / "taken" if obstacle == "a file" else tmp_path / "taken" / "cache"
     monkeypatch.setenv("LIMSIM_JAX_CACHE", str(place))
@@ -302,7 +302,7 @@ def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
 
 
 def test_network_that_was_changed_is_not_taken_from_the_cache(file, folder):
-    """Its file hash is that of the file, but its lanes are not."""
+    """It has the hash of the file, but other lanes."""
     import dataclasses
 
     network = read_network(file)

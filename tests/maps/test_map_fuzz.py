@@ -1,4 +1,4 @@
-"""Damaged, hostile and nonsensical map files: a whole `Network` or one clear `MapError`, and soon.
+"""Damaged and hostile map files: a whole `Network` or one `MapError`.
 
 Every file here is made from a sound one by seeded damage, so that a failure names what to repeat.
 """
@@ -42,7 +42,7 @@ READERS: dict[str, Reader] = {".xodr": read_opendrive, ".net.xml": read_sumo}
 
 
 def faults(network: Network) -> Iterator[str]:
-    """Everything about a network that does not hold together."""
+    """All inconsistencies of a network."""
     if not network.lanes:
         yield "no lanes"
     for key, lane in network.lanes.items():
@@ -149,7 +149,7 @@ def lane_faults(network: Network, key: str, lane: Lane) -> Iterator[str]:
 
 
 def movement_faults(network: Network) -> Iterator[str]:
-    """Faults of the ways across junctions."""
+    """Faults of movements."""
     indices = range(len(network.movements))
     for i, movement in enumerate(network.movements):
         what = f"movement {i}"
@@ -201,7 +201,7 @@ def program_faults(network: Network) -> Iterator[str]:
 
 
 def verdict(reader: Reader, path: Path) -> str | None:
-    """What is wrong with how a reader took this file; None if all is well."""
+    """The fault of a reader with this file; None if there is none."""
     start = time.process_time()  # of this process alone, so that a busy machine fails no test
     try:
         with alarm(int(6 * LIMIT)):
@@ -227,7 +227,7 @@ def verdict(reader: Reader, path: Path) -> str | None:
 
 @contextlib.contextmanager
 def alarm(seconds: int) -> Iterator[None]:
-    """Ends what takes too long."""
+    """Ends a reader that takes too long."""
 
     def ring(*_: object) -> None:
         raise TimeoutError(f"more than {seconds} s")
@@ -580,7 +580,7 @@ HOSTILE: dict[str, bytes] = {
     "100000 empty roads": xodr("<road/>" * 100_000),
     "billion laughs": xodr("<road>&a11;</road>", head=LAUGHS.format(root="OpenDRIVE")),
     "billion laughs in an attribute": xodr('<road id="&a11;"/>', head=LAUGHS.format(root="OpenDRIVE")),
-    "laughs that nobody hears": xodr(xodr_road(), head=LAUGHS.format(root="OpenDRIVE")),
+    "laughs that are not used": xodr(xodr_road(), head=LAUGHS.format(root="OpenDRIVE")),
     "external entity": xodr("<road>&x;</road>", head=OUTSIDE.format(root="OpenDRIVE")),
     "external entity in the header": xodr('<header name="&x;"/>', head=OUTSIDE.format(root="OpenDRIVE")),
     "parameter entity": xodr(xodr_road(), head=PARAMETER.format(root="OpenDRIVE")),
@@ -650,7 +650,7 @@ def test_hostile_files(tmp_path: Path, suffix: str, name: str) -> None:
 
 REFUSED = (
     "empty", "binary", "text", "other root", "not closed", "gzip garbage", "gzip cut", "billion laughs",
-    "laughs that nobody hears", "external entity", "undeclared entity", "road of no length",
+    "laughs that are not used", "external entity", "undeclared entity", "road of no length",
     "road of 1e12 m", "curvature 1e9", "same road twice", "net: billion laughs", "net: external entity",
 )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Maps of short lanes: roads of a metre or two between junctions, ways through a junction in pieces."""
+"""Maps of short lanes: short roads between junctions, connectors in pieces."""
 
 import dataclasses
 import functools
@@ -64,7 +64,7 @@ def town(pieces: int = 5):
 
 
 def vehicles(lane, s, v, goal):
-    """State of cars on lanes by name, each on its way to the end of another one."""
+    """State of cars on lanes by name, each with its goal lane."""
     _, lane_map, rows = town()
     is_goal = np.asarray(lane_map.routes.is_goal)
     goals = [int(np.argmax(is_goal[rows[name]])) for name in goal]
@@ -85,10 +85,10 @@ def test_how_far_lanes_run_side_by_side():
     lanes = [dataclasses.replace(lane, junction=None) for lane in net.lanes.values()]
     open_map = build_lane_map(network(lanes))
     assert np.asarray(open_map.beside_s)[rows["stub"], 0] == 2.0
-    assert np.asarray(open_map.beside_s)[rows["stub_left"], 1] == 2.0  # nobody is to its right there
+    assert np.asarray(open_map.beside_s)[rows["stub_left"], 1] == 2.0  # the lane to its right has ended
 
 
-def test_everybody_sees_far_enough():
+def test_sight_reaches_far_enough():
     # from the end of "in": 2 m, both pieces of the turn (42 m), five roads of 1 m, and the long one
     assert town()[1].lanes_in_sight == 9
     assert town(1)[1].lanes_in_sight == 5
@@ -96,8 +96,8 @@ def test_everybody_sees_far_enough():
 
 
 @pytest.mark.parametrize("v", [0.0, 12.0])
-def test_no_lane_change_begins_that_the_road_has_no_room_for(v):
-    """The road of 2 m goes on beside, but the junction after it does not."""
+def test_no_lane_change_begins_without_room(v):
+    """The road of 2 m has a lane beside, the junction after it has none."""
     _, lane_map, _ = town()
     time, b = (float(x[0]) for x in (drivers(1).lane_change_time, drivers(1).b))
     mean = max(v - b * time / 3, v / 2)  # it may brake gently to be done in time
@@ -107,7 +107,7 @@ def test_no_lane_change_begins_that_the_road_has_no_room_for(v):
         assert bool(place_beside(lane_map, state, jnp.ones(1, jnp.int32))[2][0]) == expected
 
 
-def test_who_changes_lanes_is_done_before_they_part():
+def test_lane_change_is_finished_before_the_lanes_part():
     _, lane_map, _ = town()
     state = vehicles(["in", "in", "in_left"], [70.0, 70.0, 30.0], [6.0, 6.0, 6.0], ["out_left"] * 3)
     time = float(state.driver.lane_change_time[0])
@@ -123,7 +123,7 @@ def test_who_changes_lanes_is_done_before_they_part():
     assert found[2] == pytest.approx(0.9 * 72 / (0.5 * time), rel=1e-5)
 
 
-def test_who_has_little_room_brakes_and_has_changed_lanes_before_they_part():
+def test_vehicle_with_little_room_brakes_to_change_lanes_in_time():
     _, lane_map, _ = town()
     time, b = (float(x[0]) for x in (drivers(1).lane_change_time, drivers(1).b))
     room = max(12.0 - b * time / 3, 6.0) * time + 2
@@ -145,7 +145,7 @@ def test_who_has_little_room_brakes_and_has_changed_lanes_before_they_part():
     assert lane[done[0]] in (rows["in_left"], rows["stub_left"], rows["through_left"])
 
 
-def test_tails_are_on_lanes_behind_as_far_as_the_vehicle_is_long():
+def test_tails_reach_back_by_the_length_of_the_vehicle():
     _, lane_map, rows = town()
     names = ["away3", "away1", "second", "out", "stub", "in"]
     before = ["away2", "away", "first", "through", "in", None]
@@ -166,7 +166,7 @@ def test_tails_are_on_lanes_behind_as_far_as_the_vehicle_is_long():
 
 
 def blocked_crossing():
-    """One has stopped on half a metre of road after a crossing, with its tail on that; one comes to it."""
+    """A vehicle has stopped just behind a crossing, with its tail on it; another approaches."""
     lanes = [
         straight("west", (-60, 0), 0.0, 60.0, successors=("cross",)),
         straight("cross", (0, 0), 0.0, 8.0, junction="J", successors=("bit",)),
@@ -189,7 +189,7 @@ def blocked_crossing():
     return lane_map, rows, state
 
 
-def test_who_is_in_a_conflict_zone_with_its_tail_two_lanes_back():
+def test_tail_two_lanes_back_occupies_a_conflict_zone():
     lane_map, rows, state = blocked_crossing()
     zones = _zones(lane_map, state, jnp.int32(1), jnp.int32(rows["up"]))
     assert int((zones.id >= 0).sum()) == 1 and bool(zones.other.any()) and not bool(zones.ego.any())
@@ -197,7 +197,7 @@ def test_who_is_in_a_conflict_zone_with_its_tail_two_lanes_back():
     assert not bool(_zones(lane_map, gone, jnp.int32(1), jnp.int32(rows["up"])).other.any())
 
 
-def test_who_waits_behind_a_short_road_is_seen_by_those_whose_way_its_tail_is_on():
+def test_tail_of_a_vehicle_behind_a_short_road_is_an_obstacle():
     lane_map, _, state = blocked_crossing()
     brake = jnp.asarray([True, False])
 
@@ -213,8 +213,8 @@ def test_who_waits_behind_a_short_road_is_seen_by_those_whose_way_its_tail_is_on
     assert float(v[-1]) == 0.0 and not np.asarray(status).any()
 
 
-def test_nobody_leaps_to_a_lane_that_begins_beside():
-    """Two lanes go on as one: who is on the one that ends beside it changes lanes before."""
+def test_no_vehicle_leaps_to_a_lane_that_begins_beside():
+    """Two lanes continue as one: vehicles on the ending lane change before."""
 
     def two(offset, beside=True):
         left, right = ("in_left", "in") if beside else (None, None)
@@ -241,8 +241,8 @@ def test_nobody_leaps_to_a_lane_that_begins_beside():
         assert rows["out"] in np.asarray(lane_map.successors)[rows["in_left"]]
 
 
-def test_a_way_in_pieces_is_followed_as_one():
-    """Who goes straight on stops behind somebody who stands on the second piece of the turn."""
+def test_connector_in_pieces_is_followed_as_one():
+    """A vehicle going straight stops behind one on the second piece of the turn."""
     _, lane_map, _ = town()
     state = vehicles(["through", "second"], [6.0, 5.0], [5.0, 0.0], ["out", "far"])
     brake = jnp.asarray([False, True])

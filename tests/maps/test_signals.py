@@ -230,7 +230,10 @@ def greens(net, program=None):
 
 
 def check_safe(net):
-    """Nothing that crosses is green (or still yellow) together but for a turn across oncoming traffic."""
+    """No crossing movements are green or yellow together.
+
+    Turns across oncoming traffic are the exception.
+    """
     row = rows(net)
     table, ids = build_conflicts(net, row), list(row)
     movement_of = {name: m for m in net.movements for name in m.via}
@@ -309,7 +312,7 @@ def test_left_hand_traffic_is_the_mirror_image():
 
 
 def test_a_tee_keeps_the_through_road_green_across_stages():
-    """What is green in two stages on end has neither yellow nor red between them."""
+    """Movements stay green between two of their stages in a row."""
     net = generate_programs(lit(intersection(arms=(0, 90, 180), lanes=2, separate_left=True)))
     program = net.programs["J"]
     assert len(greens(net)) == 3
@@ -345,7 +348,7 @@ def test_controllers_say_what_switches_together():
 
 
 def test_arrows_govern_their_turn_alone():
-    """A left arrow over a shared lane sets the left turn apart, and the light beside it has the rest."""
+    """A left arrow over a shared lane governs the left turn only."""
     net = lit(intersection())
     (plain,) = [light for light in net.traffic_lights if light.id == "Lin0_0"]
     arrow = dataclasses.replace(plain, id="arrow", turns=(Turn.LEFT,))
@@ -355,7 +358,7 @@ def test_arrows_govern_their_turn_alone():
     assert not {name for name in stage if name.startswith("in2") and not name.endswith("out3_0")}
     assert all(m.program == "J" for m in made.movements)
     check_safe(made)
-    # Without the other lights, the arrow is all there is: nobody else is signalised.
+    # Without the other lights, the arrow governs its turn alone, and no other movement is signalised.
     only = generate_programs(dataclasses.replace(net, traffic_lights=(arrow,)))
     assert [m.via[0] for m in only.movements if m.program] == ["in0_0>out3_0"]
 

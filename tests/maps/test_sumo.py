@@ -83,7 +83,7 @@ def assert_equal(path: Path) -> Network:
 
 
 def assert_sound(network: Network) -> None:
-    """What holds for any network."""
+    """Properties of any network."""
     for x in network.lanes.values():
         assert np.all(np.diff(x.s) > 0) and x.s[0] == 0, x.id
         assert np.all(np.diff(x.road_s) >= 0), x.id
@@ -114,7 +114,7 @@ def test_generated_equal_sumolib(generated, name):
 
 
 def test_the_comparison_can_fail(generated, tmp_path, monkeypatch):
-    """Each change of the file makes a mismatch of the kind that it should."""
+    """Each change of the file makes a mismatch of the expected kind."""
     path = generated["grid with lights, crossings, bicycle lanes"]
     changes = {
         "lane length": ("lane", "length", "77.77"),
@@ -332,7 +332,7 @@ def test_roundabout_and_unknown_elements_are_reported(read):
 
 @needs_shared
 def test_every_element_is_in_the_report():
-    """Per element of the file as many counts as there are elements: nothing dropped in silence."""
+    """The report counts every element of the file."""
     for path in NETS:
         _, network = compare(path)
         root = etree.parse(path).getroot()
@@ -689,7 +689,7 @@ def test_gzip_is_the_same(tmp_path):
 
 
 def test_mutated_files_raise_map_errors_only(generated, tmp_path):
-    """Whatever happens to the file: a sound network or one clear error."""
+    """Any damage gives a sound network or one clear error."""
     source = generated["grid with lights, crossings, bicycle lanes"]
     rng = random.Random(7)
     path = tmp_path / "mutant.net.xml"

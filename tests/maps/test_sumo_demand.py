@@ -339,7 +339,7 @@ def test_missing_edges_are_named(read, network, content, message):
         read(content, network=network)
     assert message in str(caught.value) and network.source in str(caught.value)
     assert caught.value.line is not None
-    assert read(content)  # without a network nobody can know
+    assert read(content)  # without a network it cannot be checked
 
 
 def test_good_edges_pass(read, network):

@@ -1,4 +1,4 @@
-"""The mathematics of an OpenDRIVE road: piecewise cubics over `s` and the reference line.
+"""Geometry of an OpenDRIVE road: piecewise cubics and the reference line.
 
 ASAM OpenDRIVE 1.8, chapters 7 (coordinate systems) and 9 (geometry). All functions are vectorised
 over `s` and take, besides `s`, the place `at` by which the record is chosen: at a border of two
@@ -18,12 +18,15 @@ Array = NDArray[np.float64]
 
 
 class Cubics:
-    """Piecewise cubics `a + b ds + c ds^2 + d ds^3`, each from its own `s` on, zero before the first."""
+    """Piecewise cubics `a + b ds + c ds^2 + d ds^3`.
+
+    Each holds from its own `s` on; before the first the value is zero.
+    """
 
     def __init__(
         self, records: list[tuple[float, float, float, float, float]], *, backwards: bool = False
     ) -> None:
-        """Take `(s, a, b, c, d)` records; of several with the same `s` the last one counts.
+        """Take `(s, a, b, c, d)` records; the last of equal `s` holds.
 
         With `backwards` the first record holds before its own `s` too.
         """
@@ -155,13 +158,14 @@ class ReferenceLine:
         return stretch[self._index(at)]
 
     def is_parametric(self, at: Array) -> NDArray[np.bool_]:
-        """Whether a parametric record is in charge."""
+        """Whether a parametric record holds here."""
         return self._kind[self._index(at)] == Kind.PARAMETRIC
 
     def _clothoid(self, u: Array, heading: Array, k: Array, c: Array) -> tuple[Array, Array]:
-        """Integral of (cos, sin) of `heading + k w + c w^2 / 2` over w in [0, u], by Gauss-Legendre.
+        """Point of a clothoid: the integral of (cos, sin) of its heading.
 
-        Quadrature rather than Fresnel functions: these lose all digits as the sharpness goes to zero.
+        The heading is `heading + k w + c w^2 / 2` for w in [0, u]. Gauss-Legendre quadrature replaces
+        Fresnel functions, which lose all digits as the sharpness approaches zero.
         """
         edges = np.arange(self._panels) / self._panels
         nodes = (edges[:, None] + _X / self._panels).ravel()

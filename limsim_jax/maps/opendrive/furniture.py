@@ -1,4 +1,4 @@
-"""Lights, signs, stop lines and crosswalks, and the lanes that they concern."""
+"""Lights, signs, stop lines and crosswalks, with the lanes that they govern."""
 
 from __future__ import annotations
 
@@ -82,12 +82,12 @@ SIGNS = {
 STOP_LINE_TYPES = {"294"}
 APPROACH = 60.0  # m; a sign further from the junction than this does not regulate it
 INSIDE = 10.0  # m; a stop line may lie this far inside the junction
-BESIDE = 12.0  # m; how far a sign may stand from the lane end that it regulates
+BESIDE = 12.0  # m; largest distance of a sign from the lane end that it regulates
 
 
 @dataclass
 class Furniture:
-    """What stands or is painted on the roads."""
+    """Signals, signs and markings of the roads."""
 
     lights: list[TrafficLight]
     signs: list[Sign]
@@ -225,9 +225,10 @@ class Furnisher:
             self.report.read(f"{kind} sign")
 
     def _heading(self, spots: list[LaneSpot], facing: float) -> float:
-        """Direction of the traffic that looks at a light: that of its lanes, else as the signal is turned.
+        """Direction (rad) of the traffic that faces a light.
 
-        Writers disagree on whether `orientation` means the traffic or the face of the light.
+        It is that of the governed lanes. Without lanes it is the orientation of the signal: writers
+        disagree on whether `orientation` means the traffic or the face of the light.
         """
         if not spots:
             return facing
@@ -235,7 +236,7 @@ class Furnisher:
         return float(np.angle(np.exp(1j * headings).sum()))
 
     def _spots(self, road: RawRoad, signal: RawSignal) -> list[LaneSpot]:
-        """Lanes that the file names: by `validity`, else by the direction that `orientation` gives."""
+        """Lanes that the file names, by `validity` or otherwise by `orientation`."""
         s = min(max(signal.s, 0.0), road.length)
         pieces = self.pieces[road.id]
         piece = next((p for p in pieces if p.start - 1e-6 <= s <= p.end + 1e-6), None)
@@ -259,7 +260,7 @@ class Furnisher:
     def _by_position(
         self, position: tuple[float, float, float], where: str, element: str, line: int | None
     ) -> list[LaneSpot]:
-        """Lanes for a signal that names none: those that enter a junction where it stands beside or above."""
+        """Lanes for a signal that names none: they enter a junction beside or below it."""
         best, score = "", BESIDE
         for name in self.incoming:
             lane = self.lanes[name]
@@ -360,7 +361,10 @@ class Furnisher:
         ]
 
     def _crossings(self, start: Array, end: Array, z: float) -> list[LaneSpot]:
-        """Where centre lines cross the segment at over 45 degrees, before or early in a junction."""
+        """Where centre lines cross the segment, before or early in a junction.
+
+        Only crossings at more than 45 degrees count.
+        """
         spots = []
         for lane in self._near(np.minimum(start, end), np.maximum(start, end), z):
             s = _crossing(lane, start, end)
@@ -369,7 +373,7 @@ class Furnisher:
             _, heading = lane.pose(s)
             along = np.array([np.cos(heading), np.sin(heading)])
             if lane.junction is not None and s > min(INSIDE, lane.length / 2):
-                continue  # the line of those who come the other way, or a guide line
+                continue  # a line for oncoming traffic, or a guide line
             if abs(float(along @ (end - start))) < 0.71 * float(np.hypot(*(end - start))):
                 spots.append(LaneSpot(lane=lane.id, s=s))
         return spots
@@ -403,7 +407,10 @@ def classify(signal: RawSignal) -> SignKind:
 
 
 def speed_value(signal: RawSignal) -> float | None:
-    """Speed in m/s that a speed sign shows: `value` in `unit`, else the subtype of the German catalogue."""
+    """Speed in m/s that a speed sign shows.
+
+    It is `value` in `unit`; without a value it is the subtype of the German catalogue.
+    """
     american = signal.country in ("US", "USA")
     unit = SPEED_UNITS.get(signal.unit.lower()) if signal.unit else (0.44704 if american else 1 / 3.6)
     if unit is None:
@@ -423,10 +430,10 @@ def speed_value(signal: RawSignal) -> float | None:
 def extend_lights(
     lights: list[TrafficLight], movements: tuple[Movement, ...], lanes: dict[str, Lane], report: ImportReport
 ) -> list[TrafficLight]:
-    """A light that the file gives to some movements of a lane holds for the others of that lane too.
+    """Extend lights to all movements of the lanes that they stop.
 
-    Who waits at a red light does not know which connecting road the file forgot. Movements that no
-    light names, from a lane of which another movement is named, are added and reported.
+    A vehicle that waits at a red light blocks the whole lane. Movements that no light names, from a lane
+    of which another movement is named, are added and reported.
     """
     own: dict[str, dict[int, None]] = defaultdict(dict)  # lane -> lights that name it
     for i, light in enumerate(lights):
@@ -507,7 +514,7 @@ def regulate(
 
 
 def downstream(spot: LaneSpot, lanes: dict[str, Lane], entry: dict[str, list[int]]) -> str | None:
-    """The lane, from the spot along the same road, that enters a junction within `APPROACH` metres."""
+    """The lane ahead that enters a junction within `APPROACH` metres."""
     name, way = spot.lane, -spot.s
     for _ in range(16):
         if name in entry:

@@ -1,8 +1,8 @@
-"""Lanes of an OpenDRIVE road: from polynomials over the road's `s` to sampled centre lines.
+"""Lanes of an OpenDRIVE road: from polynomials to sampled centre lines.
 
 A road is cut into pieces on which nothing changes but the geometry: at every lane section, speed,
 access or lane-change permission that really differs. Sections that only continue each other are
-joined, so that traffic does not meet lanes of a few centimetres.
+joined, so that there are no lanes of a few centimetres.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class RoadShape:
         self.road = road
 
     def point(self, s: float, t: float) -> tuple[float, float, float, float]:
-        """`x, y, z, heading` of the road at one `s`, `t` away from the reference line."""
+        """`x, y, z, heading` of the road at one place `s, t`."""
         s_ = np.array([min(max(s, 0.0), self.road.length)])
         x, y, heading, _, _ = self.road.reference.frame(s_, s_)
         z = self.road.elevation(s_, s_)
@@ -237,7 +237,7 @@ class Cutter:
         return pieces
 
     def _jumps(self, shape: RoadShape, section: RawSection, start: float, end: float) -> set[float]:
-        """Knots inside a section where some lane centre jumps sideways by more than `JUMP`."""
+        """Knots where a lane centre jumps sideways by more than `JUMP`."""
         knots = shape.knots(section, start, end)
         if not knots.size:
             return set()
@@ -394,7 +394,7 @@ class Cutter:
         return access
 
     def _once(self, action: str, element: str, where: str, message: str, line: int | None) -> None:
-        """Report, but the same thing only once."""
+        """Report every fact only once."""
         if (where, message) not in self._said:
             self._said.add((where, message))
             getattr(self.report, action)(element, where, message, line)
@@ -405,7 +405,7 @@ def _near(s: float, places: set[float]) -> bool:
 
 
 def _changes(lane: RawLane) -> list[float]:
-    """Where, from the section start, something besides geometry may change on a lane."""
+    """Where attributes of a lane may change, from the section start."""
     return [m.s for m in lane.marks] + [s for s, _ in lane.speeds] + [s for s, _, _ in lane.access]
 
 
@@ -419,7 +419,7 @@ def _may_mix(types: dict[int, LaneType], forward: dict[int, bool], a: int, b: in
 
 
 def _permission(section: RawSection, low: int, high: int, s: float) -> tuple[bool, bool]:
-    """Whether marks let traffic cross from lane `low` up to lane `high`, and from `high` down."""
+    """Whether marks permit a change from `low` to `high`, and back."""
     up = down = True
     borders = [n for n in range(low, high + 1) if low < n <= 0 or 0 <= n < high]
     for number in borders:
@@ -435,11 +435,12 @@ def _permission(section: RawSection, low: int, high: int, s: float) -> tuple[boo
 
 
 def crossing(mark: Mark, number: int) -> tuple[bool, bool]:
-    """Whether a mark on the outer border of lane `number` may be crossed towards larger and smaller t.
+    """Whether an outer mark may be crossed towards larger and smaller t.
 
-    `laneChange` says it outright. Without it the lines decide: of two lines the one on the driver's
-    own side counts. Two-line types name the inner line first, on lane 0 the left one (OpenDRIVE 1.8,
-    section 11.9).
+    `number`: of the lane on whose outer border the mark is.
+
+    `laneChange` states it. Without it the lines decide: of two lines the one on the driver's side counts.
+    Two-line types name the inner line first, on lane 0 the left one (OpenDRIVE 1.8, section 11.9).
     """
     match mark.change:
         case "both":
@@ -570,9 +571,9 @@ def sample_piece(road: RawRoad, piece: Piece, report: ImportReport) -> dict[int,
 
 
 def _leave_out(a: Array, b: Array, half: Array) -> tuple[Array, Array]:
-    """The part of every span `[a, b]` that is further than `half` from the borders between spans.
+    """The part of every span at least `half` from its borders.
 
-    Spans that are swallowed whole come back with start >= end.
+    A span `[a, b]` that is shorter than that is returned with start >= end.
     """
     border = b[:-1]
     half = np.minimum(half, np.minimum(border - a[0], b[-1] - border) / 2)
@@ -641,7 +642,7 @@ def _intervals(shape: RoadShape, evaluate: Evaluate, start: Array, end: Array) -
 def _lengths(
     evaluate: Evaluate, s: Array, span: NDArray[np.int64], bridge: NDArray[np.bool_], values: _Samples
 ) -> Array:
-    """Arc length of every lane between consecutive samples `[lanes, M-1]`, never quite zero."""
+    """Arc length `[lanes, M-1]` between consecutive samples, above zero."""
     step = np.diff(s)
     nodes = s[:-1, None] + step[:, None] * _X
     probe = evaluate(nodes.ravel(), np.repeat(span[1:], len(_X)))
@@ -653,7 +654,7 @@ def _lengths(
 def _report_shape(
     report: ImportReport, road: RawRoad, piece: Piece, number: int, values: _Samples, row: int
 ) -> None:
-    """Name lanes whose geometry is not that of a lane."""
+    """Report lanes whose geometry no real lane has."""
     where = f"road {road.id} section {piece.index} lane {number}"
     if (values.along[row] <= 0).any():
         report.approximated(

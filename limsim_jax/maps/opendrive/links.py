@@ -1,8 +1,8 @@
-"""How lanes join: from the file's links between roads, sections and junctions to a directed lane graph.
+"""From the links of a file to a directed graph of lanes.
 
 OpenDRIVE states links twice or more, on both sides, in terms of road direction. Here every statement
 is first reduced to one fact, "this end of that lane touches that end of this lane"; travel
-directions then make it a directed edge. So it does not matter which side said it.
+directions then make it a directed edge. It does not matter which side states it.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class _Contact:
     a: End
     b: End
     line: int | None
-    junction: str | None = None  # said by this junction
+    junction: str | None = None  # stated by this junction
 
 
 class Linker:
-    """Collects contacts between lane ends and turns them into successors, neighbours and movements."""
+    """Turns contacts between lane ends into successors, neighbours and movements."""
 
     def __init__(
         self,
@@ -89,7 +89,7 @@ class Linker:
         if a == b:
             return
         known = self.contacts.get(key)
-        if known is None or (known.junction is None and junction is not None):  # a road may say it, too
+        if known is None or (known.junction is None and junction is not None):  # a road may state it, too
             self.contacts[key] = _Contact(*key, line, junction)
 
     def _within(self, road: RawRoad) -> None:
@@ -132,7 +132,7 @@ class Linker:
                 self._touch(mine, (other.id, index, target, contact), lane.line)
 
     def _nearest_end(self, road: RawRoad, end: str, other: RawRoad, where: str, link: RoadLink) -> str:
-        """For links without a contact point: the end that lies nearer."""
+        """The nearer end, for links without a contact point."""
 
         def at(r: RawRoad, e: str) -> np.ndarray:
             s = np.array([0.0 if e == "start" else r.length])
@@ -168,7 +168,7 @@ class Linker:
     def _connection(self, junction: RawJunction, connection: RawConnection) -> None:
         where = f"junction {junction.id}"
         if junction.type == "virtual" and connection.incoming is None:
-            return  # the connecting road's own links say it all
+            return  # the connecting road's own links are complete
         if connection.incoming is None:
             self.report.ignored("connection", where, "names no incomingRoad", connection.line)
             return
@@ -252,7 +252,7 @@ class Linker:
     # --- resolving ------------------------------------------------------------------------------
 
     def _lane(self, end: End) -> tuple[LaneKey, str] | None:
-        """The sampled lane at an end of a lane record, and which end of the lane (in road s) it is."""
+        """The sampled lane at an end of a lane record, and which end."""
         road, section, number, side = end
         side, _, index = side.partition("@")
         if index:
@@ -267,7 +267,7 @@ class Linker:
         return (road, piece.index, number), side
 
     def _pass_through_dropped(self) -> None:
-        """Connect what touches the two ends of a lane section that was left out."""
+        """Connect the lanes on both sides of a dropped lane section."""
         dropped = {
             (road.id, k)
             for road in self.roads.values()
@@ -387,7 +387,7 @@ def build_movements(
     through: dict[tuple[str, str], set[str]],
     report: ImportReport,
 ) -> tuple[tuple[Movement, ...], dict[str, Junction]]:
-    """All ways across the junctions, and the junctions."""
+    """All movements across the junctions, and the junctions."""
     found: list[Movement] = []
 
     def add(junction: str, incoming: str, outgoing: str, via: tuple[str, ...]) -> None:
@@ -463,7 +463,7 @@ def build_movements(
 
 
 def with_turns(movements: tuple[Movement, ...], lanes: dict[str, Lane]) -> tuple[Movement, ...]:
-    """Turn of every movement: its change of heading, measured from the way that the road itself goes.
+    """Turn of every movement: its change of heading relative to the road.
 
     A motorway that bends inside a junction is no left turn: of the movements of an incoming road that
     follow a bend of more than `BEND` radius, the one to the road with the most lanes (then the
@@ -504,7 +504,10 @@ def with_priorities(
     junctions: dict[str, RawJunction],
     report: ImportReport,
 ) -> tuple[Movement, ...]:
-    """Apply `<priority high= low=>` records: ids of connecting (or, in old files, incoming) roads."""
+    """Apply `<priority high= low=>` records.
+
+    They name connecting roads or, in old files, incoming ones.
+    """
     yields: dict[int, set[int]] = defaultdict(set)
     high_side: set[int] = set()
     for junction in junctions.values():

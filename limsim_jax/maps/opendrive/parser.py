@@ -137,7 +137,7 @@ class Parser:
         return self.get.number(e, "s", 0.0), self.get.text(e, "type", ""), speed
 
     def _speed(self, e: Element) -> float | None:
-        """m/s; None for 'undefined', infinity for 'no limit'."""
+        """Speed (m/s); None for 'undefined', infinity for 'no limit'."""
         raw = self.get.text(e, "max", "")
         if raw.lower() in ("", "undefined"):
             return None

@@ -32,7 +32,7 @@ def read_opendrive(path: str | Path) -> Network:
 
     Geometry is evaluated in float64 from the file's own polynomials and clothoids, at every record of
     every element, and sampled so that `Lane.pose` is within 0.1 mm of it. What is approximated,
-    ignored or repaired stands in `Network.report`.
+    ignored or repaired is in `Network.report`.
 
     Raises:
         MapError: the file cannot be read as a road network; names file, line, element and reason.
@@ -127,7 +127,7 @@ def read_opendrive(path: str | Path) -> Network:
         crosswalks=tuple(furniture.crosswalks),
         report=report,
     )
-    for seam in seams(network):  # positions stay as the file has them
+    for seam in seams(network):  # positions stay as they are in the file
         report.approximated(
             "lane link",
             f"{seam.before} to {seam.after}",
@@ -151,7 +151,7 @@ def _by_id(records: Iterable[T], tag: str, path: Path) -> dict[str, T]:
 
 
 def _attachments(road: RawRoad, roads: dict[str, RawRoad]) -> set[float]:
-    """Places where other roads attach to the middle of this one (virtual junctions)."""
+    """Places (m) where virtual junctions attach other roads to this one."""
     return {
         link.s
         for other in roads.values()
@@ -172,7 +172,7 @@ def _sound(lane: Lane) -> bool:
 
 
 def _report_road(road: RawRoad, pieces: list[Piece], report: ImportReport) -> None:
-    """Name what is odd about the geometry of a road as a whole."""
+    """Report oddities in the geometry of a whole road."""
     where = f"road {road.id}"
     if road.superelevation.coefficients.any():
         s = np.linspace(0.0, road.length, 65)
@@ -223,7 +223,7 @@ def _report_road(road: RawRoad, pieces: list[Piece], report: ImportReport) -> No
 def _connector_speeds(
     lanes: dict[str, Lane], pieces: dict[str, list[Piece]], roads: dict[str, RawRoad], report: ImportReport
 ) -> None:
-    """Connectors for which the file gives no limit take the lower one of the lanes that they join."""
+    """Give connectors without a limit the lower one of their neighbours."""
     assumed = {
         lane_id((road, piece.index, number))
         for road, found in pieces.items()

@@ -1,4 +1,4 @@
-"""What an OpenDRIVE file says, element by element, as plain records; nothing is interpreted yet."""
+"""Elements of an OpenDRIVE file as plain records, not interpreted."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class RoadLink:
 
 @dataclass(frozen=True, kw_only=True)
 class Mark:
-    """Road mark on the outer border of a lane, from `s` (m from the section start) on."""
+    """Road mark on the outer border of a lane, from `s` on."""
 
-    s: float
+    s: float  # m from the section start
     type: str
     change: str | None  # increase, decrease, both, none
     rules: tuple[str, ...] = ()
@@ -45,7 +45,7 @@ class RawLane:
     border: Cubics | None = None
     marks: list[Mark] = field(default_factory=list)
     speeds: list[tuple[float, float]] = field(default_factory=list)  # (s from section start, m/s)
-    access: list[tuple[float, str, tuple[str, ...]]] = field(default_factory=list)  # s, rule, who
+    access: list[tuple[float, str, tuple[str, ...]]] = field(default_factory=list)  # s, rule, classes
     line: int | None = None
 
 
@@ -61,7 +61,7 @@ class RawSection:
 
 @dataclass(kw_only=True)
 class RawSignal:
-    """`signal` or `signalReference` (then the attributes of the signal itself are empty)."""
+    """`signal`, or `signalReference` without the attributes of the signal."""
 
     id: str
     s: float
@@ -125,7 +125,10 @@ class RawRoad:
 
 @dataclass(frozen=True, kw_only=True)
 class RawConnection:
-    """`connection` of a junction; `road` is the connecting (or, in direct junctions, the linked) road."""
+    """`connection` of a junction.
+
+    `road` is the connecting road or, in direct junctions, the linked road.
+    """
 
     incoming: str | None
     road: str

@@ -1,4 +1,4 @@
-"""Whether the parts of a SUMO demand exist: types, routes, edges, lanes, stopping places."""
+"""Checks that all parts exist to which a SUMO demand refers."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def check_routes(demand: Demand) -> None:
 
 
 def check_network(demand: Demand, network: Network) -> None:
-    """Every edge and lane that is named has to be in the network."""
+    """Raise `MapError` for an edge or lane outside the network."""
     good: set[str] = set()  # routes checked
 
     def check_route(name: str, who: str, file: str, line: int | None) -> None:

@@ -1,4 +1,4 @@
-"""SUMO's vehicle classes, and what they say about lanes."""
+"""SUMO's vehicle classes, and the types of lanes for them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ ENGINE_CLASS = {
     "moped": "motorcycle",
     "emergency": "emergency",
 }
-"""Vehicle class of the engine for a vehicle of a SUMO class; the others are no motor traffic on roads."""
+"""Vehicle class of the engine for a SUMO class; the others are no motor traffic."""
 
 SPECIAL_RIGHTS = frozenset({"emergency", "authority", "army", "vip"})
 MOTOR = frozenset("passenger private evehicle delivery truck trailer motorcycle".split())
@@ -61,4 +61,7 @@ TYPE_OF_CLASSES = (
     (FOOT, LaneType.SIDEWALK),
     (SPECIAL_RIGHTS | {"custom1", "custom2"}, LaneType.RESTRICTED),
 )
-"""Lane type by the first group of classes of which one is allowed, on lanes without general motor traffic."""
+"""Lane types of lanes without general motor traffic.
+
+The first group counts of which a class is allowed.
+"""

@@ -1,4 +1,4 @@
-"""SUMO configurations (`.sumocfg`): which files a simulation loads, and for what time."""
+"""SUMO configurations (`.sumocfg`): files and times of a simulation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from limsim_jax.maps.xml import Element, XmlReader, read_bytes
 
 
 def read_sumocfg(path: str | Path) -> SumoConfig:
-    """Read which files a SUMO configuration loads, and for what time.
+    """Read the files and times of a SUMO configuration.
 
     Raises:
       MapError: the file cannot be used, names no network, or names files that do not exist.

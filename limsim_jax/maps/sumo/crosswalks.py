@@ -14,7 +14,7 @@ from limsim_jax.maps.sumo.elements import Elements, polyline
 
 
 def build_crosswalks(elements: Elements, lanes: dict[str, Lane]) -> tuple[Crosswalk, ...]:
-    """Every pedestrian crossing, with the stretches (m) of the lanes that it covers."""
+    """Every pedestrian crossing, with the stretches (m) of lanes below it."""
     crosswalks = []
     inside: dict[str | None, list[Lane]] = defaultdict(list)
     for lane in lanes.values():
@@ -40,7 +40,7 @@ def build_crosswalks(elements: Elements, lanes: dict[str, Lane]) -> tuple[Crossw
 
 
 def _spans(lane: Lane, outline: Float[Array, "K 2"]) -> list[tuple[float, float]]:
-    """Arc lengths (m) between which the centre line of a lane is inside a polygon."""
+    """Stretches (m) of a lane's centre line inside a polygon."""
     s = np.union1d(lane.s, np.linspace(0.0, lane.length, max(2, math.ceil(lane.length / 0.5) + 1)))
     xy = lane.pose(s)[0][:, :2]
     a, da = xy[:-1, None], np.diff(xy, axis=0)[:, None]
@@ -57,7 +57,7 @@ def _spans(lane: Lane, outline: Float[Array, "K 2"]) -> list[tuple[float, float]
     middle = lane.pose((cuts[1:] + cuts[:-1]) / 2)[0][:, :2]
     area = shapely.Polygon(outline)
     inside = shapely.contains_xy(area, middle[:, 0], middle[:, 1])
-    along = shapely.distance(shapely.points(middle), area.exterior) < 0.05  # the border, not across it
+    along = shapely.distance(shapely.points(middle), area.exterior) < 0.05  # along the border, not across it
     spans: list[tuple[float, float]] = []
     for lo, hi, covered in zip(cuts[:-1], cuts[1:], inside & ~along, strict=True):
         if covered and hi - lo > 1e-6:

@@ -13,7 +13,9 @@ from limsim_jax.maps.sumo.elements import Elements, FileLane
 from limsim_jax.maps.sumo.links import Links
 from limsim_jax.maps.sumo.shapes import RESOLUTION, Curve, fit_polyline
 
-BEND_SHARE = 0.1  # share of the lane width by which our curve may leave the shape of an ordinary lane
+BEND_SHARE = (
+    0.1  # largest deviation of a curve from the shape of an ordinary lane, as a share of the lane width
+)
 
 
 class LaneCurve(NamedTuple):
@@ -26,7 +28,7 @@ class LaneCurve(NamedTuple):
 
 
 def fit_lanes(elements: Elements, links: Links) -> dict[str, LaneCurve]:
-    """Fit a curve to the shape of every lane. Raises `MapError` for a lane without a shape."""
+    """Fit a curve to every lane, by id. Raises `MapError` for an empty shape."""
     curves: dict[str, LaneCurve] = {}
     worst: dict[str, tuple[float, int, str]] = {}
 
@@ -55,7 +57,7 @@ def fit_lanes(elements: Elements, links: Links) -> dict[str, LaneCurve]:
             add(lane, curve, 0.0, curve.total, curve.vertex_s)
             note((lane,), curve)
     # Inside junctions netconvert samples a curve that is tangent to the lanes at both ends, and cuts it
-    # where vehicles wait: so the lanes of a movement are one curve.
+    # where vehicles wait. So the lanes of a movement form one curve.
     for connection in (c for lane in elements.lanes.values() for c in lane.outgoing if c in links.chains):
         chain = links.chains[connection]
         if not chain or any(lane.edge.function != "internal" or lane.id in curves for lane in chain):
@@ -88,9 +90,10 @@ def fit_lanes(elements: Elements, links: Links) -> dict[str, LaneCurve]:
 
 
 def _compare_lengths(elements: Elements) -> None:
-    """Report declared lengths that differ from those of the shapes by more than 1 % and 0.1 m.
+    """Report declared lengths that differ from those of the shapes.
 
-    The lanes of an edge share one length: netconvert writes the mean of their shapes.
+    More than 1 % and 0.1 m count. The lanes of an edge share one length: netconvert writes the mean of
+    their shapes.
     """
     parallel: list[tuple[float, str]] = []
     for edge in elements.edges.values():
@@ -112,7 +115,7 @@ def _compare_lengths(elements: Elements) -> None:
 
 
 def _clean(elements: Elements, lane: FileLane) -> Float[Array, "K 3"]:
-    """The shape without repeated points; a shape without extent becomes 1 cm long."""
+    """The shape without repeated points, at least 1 cm long."""
     line = lane.element.sourceline
     points = lane.points
     if not len(points):
@@ -132,7 +135,7 @@ def _clean(elements: Elements, lane: FileLane) -> Float[Array, "K 3"]:
 
 
 def _heading_around(elements: Elements, lane: FileLane) -> float:
-    """Direction of the lanes before or after a lane whose own shape has none."""
+    """Direction (rad) for a lane without extent, from its neighbours."""
     lanes = elements.lanes.values()
     sources = [other.points[-2:] for other in lanes for c in other.outgoing if c.via is lane]
     targets = [(c.via or c.target).points[:2] for c in lane.outgoing]

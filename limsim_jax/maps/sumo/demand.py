@@ -30,14 +30,14 @@ from limsim_jax.maps.xml import Element, XmlReader, read_bytes
 
 
 def read_demand(paths: str | Path | Iterable[str | Path], network: Network | None = None) -> Demand:
-    """Read route and additional files, in the order in which SUMO would load them.
+    """Read route and additional files, in the order of SUMO's options.
 
     Args:
       paths: one file or several that refer to one another, plain or gzipped.
-      network: if given, every edge and lane that the demand names has to be in it.
+      network: if given, it must have every edge and lane that the demand names.
 
     Raises:
-      MapError: a file cannot be used, or refers to what does not exist; names file, line and element.
+      MapError: a file cannot be used, or refers to a missing part; names file, line and element.
     """
     reader = _Reader()
     for path in [paths] if isinstance(paths, str | Path) else paths:
@@ -50,7 +50,6 @@ def read_demand(paths: str | Path | Iterable[str | Path], network: Network | Non
     return demand
 
 
-# What becomes of elements that are not demand of vehicles.
 _IGNORED = {
     "person": "pedestrians and passengers are not simulated",
     "personFlow": "pedestrians and passengers are not simulated",

@@ -143,7 +143,7 @@ class Elements:
         self.xml.ignore_unasked(self.root)
 
     def done(self, element: Element, count: bool = True) -> None:
-        """Count an element as read, and what nobody asked for in it as ignored."""
+        """Count an element as read, and its unused attributes as ignored."""
         if count:
             self.report.read(element.tag)
         self.xml.ignore_unasked(element)
@@ -171,7 +171,7 @@ class Elements:
                     return set(VEHICLE_CLASSES)
                 if name in VEHICLE_CLASSES:
                     found.add(name)
-                elif name and name != "ignoring":  # vehicles of that class are bound by nothing
+                elif name and name != "ignoring":  # vehicles of that class ignore all permissions
                     self.xml.ignore(element, f"vehicle class '{name}' is unknown")
             return found
 
@@ -202,7 +202,7 @@ class Elements:
             if edge.function == "normal":
                 xml.text(element, name)
         for name in ("priority", "name", "type", "crossingEdges", "shape", "spreadType"):
-            xml.text(element, name, None)  # the shape of the edge is what the lane shapes were built from
+            xml.text(element, name, None)  # netconvert built the lane shapes from the shape of the edge
         if bidi := xml.text(element, "bidi", None):
             message = f"shares its track with edge '{bidi}'; the two are independent here"
             self.report.approximated("edge", edge.id, message, element.sourceline)
@@ -235,7 +235,7 @@ class Elements:
         self.done(element, count=not bidi)
 
     def _stop_offset(self, element: Element, inherited: float) -> float:
-        """Distance (m) of the stop position from the end of a lane, for ordinary cars."""
+        """Distance (m) for cars from the stop position to the lane end."""
         offset = inherited
         for child in element.findall("stopOffset"):
             value = self.xml.number(child, "value", minimum=0.0)
@@ -313,7 +313,7 @@ class Elements:
         )
         if connection.link is not None and connection.link < 0:
             raise xml.error(element, "linkIndex is negative")
-        xml.text(element, "uncontrolled", None)  # the light of the junction leaves it alone: it has no tl
+        xml.text(element, "uncontrolled", None)  # the light of the junction does not control it: it has no tl
         if connection.via is None and connection.allowed != VEHICLE_CLASSES:
             message = "no lane inside the junction that could carry its permissions"
             self.report.approximated("connection", connection_name(element), message, element.sourceline)
@@ -325,7 +325,10 @@ class Elements:
 
 
 def polyline(xml: XmlReader, element: Element, name: str) -> Float[Array, "K 3"]:
-    """A polyline `x,y[,z] x,y[,z] ...`; z is 0 where the file has none. Empty if the attribute is."""
+    """The points `[K, 3]` (m) of a polyline `x,y[,z] x,y[,z] ...`.
+
+    z is 0 where the file has none. An empty attribute has no points.
+    """
     points = []
     for item in xml.text(element, name, "").split():
         parts = item.split(",")
@@ -339,7 +342,7 @@ def polyline(xml: XmlReader, element: Element, name: str) -> Float[Array, "K 3"]
 
 
 def connection_name(element: Element) -> str:
-    """A `<connection>` by the lanes that it joins."""
+    """Name of a `<connection>`: the lanes that it joins."""
     get = element.get
     return f"from {get('from')}_{get('fromLane')} to {get('to')}_{get('toLane')}"
 

@@ -15,7 +15,7 @@ _WITHOUT_REQUESTS = frozenset({"dead_end", "unregulated", "district", "rail_sign
 
 
 def build_movements(elements: Elements, links: Links) -> tuple[tuple[Movement, ...], dict[str, Junction]]:
-    """All movements across junctions, and the junctions by id. Raises `MapError`."""
+    """All movements, and all junctions by id. Raises `MapError`."""
     xml, report = elements.xml, elements.report
     movements: list[Movement] = []
     junctions = {}
@@ -25,7 +25,7 @@ def build_movements(elements: Elements, links: Links) -> tuple[tuple[Movement, .
         if edge.junction is not None:
             inside[edge.junction] += [lane.id for lane in edge.lanes]
     for element in elements.junction_elements.values():
-        if xml.text(element, "type") == "internal":  # where vehicles wait: the chains of via lanes say so
+        if xml.text(element, "type") == "internal":  # a place to wait: the chains of via lanes state it, too
             for name in ("type", "x", "y", "z", "incLanes", "intLanes", "shape"):
                 xml.text(element, name, "")
             xml.ignore_children(element)
@@ -120,7 +120,7 @@ def _requests(elements: Elements, element: Element, count: int) -> list[tuple[st
         elements.done(child, count=not itself)
     if not rows:
         if count and xml.text(element, "type") not in _WITHOUT_REQUESTS:
-            message = f"no requests for its {count} links: nobody has to yield"
+            message = f"no requests for its {count} links: no movement has to yield"
             elements.report.approximated("junction", element.get("id"), message, element.sourceline)
         return []
     if sorted(rows) != list(range(count)):
@@ -131,7 +131,7 @@ def _requests(elements: Elements, element: Element, count: int) -> list[tuple[st
 def stop_positions(
     elements: Elements, movements: tuple[Movement, ...], lanes: dict[str, Lane]
 ) -> tuple[tuple[StopLine, ...], tuple[TrafficLight, ...]]:
-    """Stop lines and light heads at the ends of lanes, where SUMO has them."""
+    """Stop lines and light heads, at the ends of lanes."""
     regulated = {Control.SIGNAL, Control.STOP, Control.ALL_WAY_STOP, Control.YIELD}
     stop_lines: dict[str, StopLine] = {}
     lights: dict[tuple[str, str], TrafficLight] = {}
@@ -157,5 +157,5 @@ def stop_positions(
 
 
 def _bits(text: str) -> Iterator[int]:
-    """Indices of the ones in a bit string whose last letter is index 0."""
+    """Indices of the ones in a bit string, from its last letter."""
     return (i for i, bit in enumerate(reversed(text)) if bit == "1")

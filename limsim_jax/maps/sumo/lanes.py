@@ -16,7 +16,7 @@ from limsim_jax.maps.sumo.links import Links
 from limsim_jax.maps.sumo.programs import short_list
 from limsim_jax.maps.sumo.shapes import wrap
 
-KINK = 5.0  # degrees between a lane and the next, from which on it is reported
+KINK = 5.0  # degrees; a larger angle between a lane and the next is reported
 
 _UNUSED_TYPES = frozenset("shoulder border stop restricted parking median curb sidewalk".split())
 
@@ -70,7 +70,7 @@ def build_lanes(elements: Elements, links: Links) -> dict[str, Lane]:
 
 
 def report_kinks(elements: Elements, lanes: dict[str, Lane]) -> None:
-    """Report where lanes that meet do so at an angle: the file has them so, and no lane can mend it."""
+    """Report lanes that meet at an angle: they stay as in the file."""
     kinks = []
     for lane in lanes.values():
         for other in (lanes[target] for target in lane.successors):
@@ -86,7 +86,7 @@ def report_kinks(elements: Elements, lanes: dict[str, Lane]) -> None:
 
 
 def _access(lane: FileLane) -> frozenset[str]:
-    """Classes of SUMO by their names, and those of the engine that go by other names."""
+    """Vehicle classes of SUMO and the engine on a lane."""
     extra = {ENGINE_CLASS[c] for c in ("passenger", "delivery") if c in lane.allowed}
     return lane.allowed | extra
 
@@ -96,8 +96,8 @@ def _lane_type(elements: Elements, lane: FileLane) -> LaneType:
     if lane.edge.function in {"crossing", "walkingarea"}:
         return LaneType.SIDEWALK
     if lane.edge.function == "connector":
-        return LaneType.NONE  # joins a district to the net; nobody drives on it
-    if not allowed:  # nets made from OpenDRIVE still say what it was
+        return LaneType.NONE  # joins a district to the net; no road for vehicles
+    if not allowed:  # nets made from OpenDRIVE keep its type
         kind = elements.xml.text(lane.element, "type", "")
         return LaneType(kind) if kind in _UNUSED_TYPES else LaneType.NONE
     if allowed & MOTOR:
@@ -110,7 +110,10 @@ def _lane_type(elements: Elements, lane: FileLane) -> LaneType:
 
 
 def _neighbours(elements: Elements, lane: FileLane) -> tuple[FileLane | None, FileLane | None]:
-    """Left and right. Index 0 lies at the edge of the road: on the left with left-hand traffic."""
+    """Left and right neighbour.
+
+    Index 0 lies at the edge of the road: on the left with left-hand traffic.
+    """
     if lane.edge.function not in DRIVEN:
         return None, None
     lanes = lane.edge.lanes
@@ -122,7 +125,10 @@ def _neighbours(elements: Elements, lane: FileLane) -> tuple[FileLane | None, Fi
 def _may_change(
     report: ImportReport, lane: FileLane, other: FileLane | None, granted: frozenset[str]
 ) -> bool:
-    """Whether ordinary motor vehicles may change to a neighbour; `granted`: whom `lane` lets do so."""
+    """Whether ordinary motor vehicles may change to a neighbour.
+
+    `granted`: classes that may leave `lane` to that side.
+    """
     if other is None:
         return False
     common = lane.allowed & other.allowed & ENGINE_CLASS.keys()
@@ -130,7 +136,7 @@ def _may_change(
     if granted & ordinary and ordinary - granted:
         message = f"only {short_list(sorted(granted & ordinary))} may change to {other.id}; here all may"
         report.approximated("lane", lane.id, message, lane.element.sourceline)
-    return bool(granted & (ordinary or common))  # lanes for those with special rights are theirs
+    return bool(granted & (ordinary or common))  # vehicles with special rights count on their own lanes
 
 
 def _opposite(elements: Elements, lane: FileLane) -> str | None:
@@ -142,10 +148,10 @@ def _opposite(elements: Elements, lane: FileLane) -> str | None:
 def _along_road(
     edge: FileEdge, middle: tuple[Array, Array, Array], s: Array, xy: Array
 ) -> Float[Array, " M"]:
-    """Coordinate along the edge (m) of the samples of a lane: that of the middle lane abreast of them.
+    """Coordinate along the edge (m) of the samples of a lane.
 
-    `middle` is its s, xy and heading. Where a lane reaches beyond the ends of the middle one, the
-    coordinate goes on below 0 or above the length of the edge.
+    It is that of the middle lane abreast of them. `middle` is its s, xy and heading. Where a lane reaches
+    beyond the ends of the middle one, the coordinate goes on below 0 or above the length of the edge.
     """
     s_ref, xy_ref, heading_ref = middle
     scale = edge.lanes[0].length / s_ref[-1]

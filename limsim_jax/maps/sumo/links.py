@@ -1,4 +1,4 @@
-"""Which connections cross a junction, in which order, and over which lanes inside it."""
+"""Connections across junctions, and the lanes inside that carry them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ class Links:
 
 
 def find_links(elements: Elements) -> Links:
-    """Find the connections across all junctions, and place the edges inside. Raises `MapError`."""
+    """Find the connections across all junctions. Raises `MapError`.
+
+    The edges inside get the id of their junction.
+    """
     links = {
         junction: _links(elements, element)
         for junction, element in elements.junction_elements.items()
@@ -32,8 +35,11 @@ def find_links(elements: Elements) -> Links:
 
 
 def _links(elements: Elements, element: Element) -> list[Connection]:
-    """Connections across a junction in the order of its request indices: SUMO counts the connections
-    of its incoming lanes one after the other, leaving out ways on and off walking areas."""
+    """Connections across a junction in the order of its request indices.
+
+    SUMO counts the connections of its incoming lanes one after the other, without those on and off
+    walking areas.
+    """
     links = []
     for lane_id in elements.xml.text(element, "incLanes").split():
         lane = elements.lanes.get(lane_id)
@@ -54,7 +60,10 @@ def _links(elements: Elements, element: Element) -> list[Connection]:
 
 
 def _chain(elements: Elements, connection: Connection) -> tuple[FileLane, ...]:
-    """The lanes inside the junction, in order: more than one where a vehicle may wait inside."""
+    """The lanes inside the junction, in order.
+
+    There are several where a vehicle may wait inside.
+    """
     if connection.target.edge.function == "crossing":
         return (connection.target,)
     chain: list[FileLane] = []

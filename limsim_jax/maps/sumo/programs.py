@@ -15,7 +15,7 @@ DEMAND_ROOTS = tuple("additional additionals add routes route-alternatives trips
 
 
 class Programs:
-    """The programs of all traffic lights: one in use per light, the others beside it."""
+    """The programs of all traffic lights, one of them in use."""
 
     def __init__(self, report: ImportReport) -> None:
         self.report = report
@@ -72,7 +72,7 @@ class Programs:
         state = xml.text(element, "state")
         if not state or set(state) - set("ryYGguosO"):
             raise xml.error(element, f"state='{state[:40]}' has letters other than r y Y G g u s o O")
-        state = state.replace("Y", "y")  # yellow for a stream with priority: as yellow as the other
+        state = state.replace("Y", "y")  # yellow of a stream with priority means the same
 
         def bound(name: str) -> float | None:  # SUMO writes -1 for 'none'
             value = xml.number(element, name, None)

@@ -1,4 +1,4 @@
-"""The SUMO reader: elements first, then what follows from them."""
+"""The SUMO reader: from elements to a `Network`."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def read_sumo(path: str | Path, additional: Iterable[str | Path] = ()) -> Networ
       additional: additional files whose `<tlLogic>` programs join those of the network.
 
     Returns:
-      The network. Of several programs of a traffic light the one loaded last is in use, as in SUMO, and
-      has the light's id; the others are kept under `light:program`.
+      The network. Of several programs of a traffic light the last one is in use, as in SUMO, and has the id
+      of the light. The others are kept as `light:program`.
 
     Raises:
       MapError: the file cannot be used; names file, line, element and reason.

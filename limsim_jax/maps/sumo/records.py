@@ -1,6 +1,6 @@
 """SUMO's demand as plain host records.
 
-Values stand as the files give them; nothing is drawn, routed or expanded here.
+Values are those of the files; nothing is drawn, routed or expanded here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ DEFAULT_TYPE = "DEFAULT_VEHTYPE"
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedFactor:
-    """Normal distribution of the factor on the speed limit, cut off at both ends."""
+    """Truncated normal distribution of the factor on the speed limit."""
 
     mean: float = 1.0
     deviation: float = 0.1
@@ -27,7 +27,7 @@ class SpeedFactor:
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleType:
-    """A `<vType>`, with SUMO's defaults of its vehicle class for what the file leaves open."""
+    """A `<vType>`, with SUMO's defaults of its vehicle class."""
 
     id: str
     vehicle_class: str = "passenger"  # SUMO's abstract vehicle class
@@ -40,7 +40,7 @@ class VehicleType:
     accel: float  # m/s^2
     decel: float  # m/s^2
     emergency_decel: float  # m/s^2
-    apparent_decel: float  # m/s^2, what others take `decel` to be
+    apparent_decel: float  # m/s^2, `decel` as other vehicles estimate it
     max_speed: float  # m/s
     tau: float = 1.0  # s
     sigma: float = 0.5  # driver imperfection of Krauss' model
@@ -77,7 +77,7 @@ class Stop:
 
 @dataclass(frozen=True, kw_only=True)
 class StopPlace:
-    """A `<busStop>`, `<trainStop>`, `<containerStop>`, `<chargingStation>` or `<parkingArea>`."""
+    """A `<busStop>`, `<parkingArea>` or another stopping place."""
 
     id: str
     kind: str
@@ -90,7 +90,10 @@ class StopPlace:
 
 @dataclass(frozen=True, kw_only=True)
 class Route:
-    """A `<route>`: the edges in order. One inside a vehicle has the id of the vehicle behind a `!`."""
+    """A `<route>`: the edges in order.
+
+    A route inside a vehicle has the id of the vehicle behind a `!`.
+    """
 
     id: str
     edges: tuple[str, ...]
@@ -104,10 +107,10 @@ class Route:
 
 @dataclass(frozen=True, kw_only=True)
 class Vehicle:
-    """A `<vehicle>` (with a route), a `<trip>` (with origin and destination), or what a flow emits.
+    """A `<vehicle>`, a `<trip>`, or what a flow emits.
 
-    Departure and arrival values are numbers or SUMO's words for how to choose one ("best", "random",
-    "max", ...), as the file has them.
+    Vehicles have a route, trips an origin and a destination. Departure and arrival values are numbers or
+    SUMO's words for how to choose one ("best", "random", "max", ...), as the file has them.
     """
 
     id: str
@@ -133,9 +136,9 @@ class Vehicle:
 
 @dataclass(frozen=True, kw_only=True)
 class Flow:
-    """A `<flow>`: vehicles from `begin` to `end`, by the one of `number`, ... that is given.
+    """A `<flow>`: vehicles from `begin` to `end`.
 
-    With `number` alone they are evenly spaced.
+    One of `number`, `period` and the fields below it is given. With `number` alone they are evenly spaced.
     """
 
     vehicle: Vehicle  # what it emits; `depart` is `begin`
@@ -150,7 +153,7 @@ class Flow:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Demand:
-    """Everything that route and additional files say about vehicles, in file order."""
+    """All content of route and additional files, in file order."""
 
     types: dict[str, VehicleType] = field(default_factory=dict)
     type_distributions: dict[str, Distribution] = field(default_factory=dict)

@@ -27,14 +27,17 @@ STEP = 1e-3  # m, between two samples that bracket a jump of curvature
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Curve:
-    """A chain of `A` circular arcs (curvature 0: straight lines), continuous in position and heading."""
+    """A chain of `A` circular arcs, continuous in position and heading.
+
+    Arcs of curvature 0 are straight lines.
+    """
 
     xy: Float[Array, "A 2"]  # m, where each arc starts
     heading: Float[Array, " A"]  # rad, there, unwrapped
     curvature: Float[Array, " A"]  # 1/m
     length: Float[Array, " A"]  # m
     vertex_s: Float[Array, " K"]  # m, arc length abreast of each vertex of the polyline
-    deviation: float  # m, how far it leaves the polyline
+    deviation: float  # m, largest distance from the polyline
     spikes: int  # vertices left out because the polyline folds back there
 
     @property
@@ -47,7 +50,7 @@ class Curve:
         return float(self.at(np.array([s]))[1][0])
 
     def at(self, s: Float[Array, " M"]) -> tuple[Float[Array, "M 2"], Float[Array, " M"], Float[Array, " M"]]:
-        """Position (m), heading (rad, unwrapped) and curvature (1/m) at arc length `s` (m)."""
+        """Position (m), heading (rad, unwrapped) and curvature (1/m) at `s`."""
         start = np.concatenate([[0.0], np.cumsum(self.length)])
         i = np.clip(np.searchsorted(start, s, side="right") - 1, 0, len(self.length) - 1)
         half = 0.5 * self.curvature[i] * (s - start[i])
@@ -57,7 +60,7 @@ class Curve:
         return xy, self.heading[i] + 2 * half, self.curvature[i]
 
     def samples(self, lo: float = 0.0, hi: float = math.inf) -> Float[Array, " M"]:
-        """Arc lengths (m) from `lo` to `hi` between which cubic Hermite interpolation is good.
+        """Arc lengths (m) for cubic Hermite interpolation from `lo` to `hi`.
 
         Its error is at most `SAMPLE_ERROR`. A jump of curvature lies between two samples 1 mm apart, so
         that linear interpolation keeps it.
@@ -104,9 +107,10 @@ def _simplify(points: Float[Array, "K 3"], tolerance: float) -> NDArray[np.int64
 
 
 def _biarc(p0: Array, h0: float, p1: Array, h1: float) -> list[tuple[Array, float, float, float]]:
-    """Two arcs (start, heading, curvature, length) from pose to pose, or one line.
+    """Two arcs from pose to pose, or one line.
 
-    The two distances from the ends to the control points are equal (Bolton 1975, 'Biarc curves').
+    Each has its start, heading, curvature and length. The two distances from the ends to the control
+    points are equal (Bolton 1975, 'Biarc curves').
     """
     v = p1 - p0
     t0 = np.array([math.cos(h0), math.sin(h0)])
@@ -136,10 +140,12 @@ def fit_polyline(
     start_heading: float | None = None,
     end_heading: float | None = None,
 ) -> Curve:
-    """Curve of arcs and lines over a polyline; starts and ends where the polyline does.
+    """Fit a curve of arcs and lines to a polyline.
+
+    Both have the same ends.
 
     1. Vertices that are within 1 cm of the line through the others are left out (Douglas-Peucker): at
-       the usual two decimals they tell of rounding, not of the road.
+       the usual two decimals they stem from rounding, not from the road.
     2. A vertex where the polyline turns is a sample of a bend: the curve goes through it, in the
        direction of the circle through it and its neighbours, and bulges over the segments as the
        bend did that was sampled. On a segment more than twice as long as the one beyond the vertex the
@@ -240,7 +246,10 @@ def fit_polyline(
 
 
 def _end_heading(segment: float, given: float | None, turn: Float[Array, " J"]) -> float:
-    """The given heading if the end segment can be a chord of a bend that has it, else the segment's."""
+    """Heading (rad) of a curve at its end.
+
+    It is the given one if the end segment can be a chord of a bend with it, otherwise that of the segment.
+    """
     if given is None or not len(turn):
         return segment
     return given if abs(wrap(given - segment)) <= abs(float(turn[0])) else segment
