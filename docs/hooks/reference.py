@@ -343,21 +343,12 @@ def metrics() -> str:
     ]
     for section in SECTIONS:
         rows = [
-            [
-                f"`{x.name}`",
-                unit,
-                _sentence(words or x.name),
-                _formula(x.formula),
-                x.source,
-                x.missing,
-                x.better,
-            ]
+            [f"`{x.name}`", split_unit(x.meaning)[0], x.better, _definition(x)]
             for x in catalog()
             if x.section == section
-            for unit, words in [split_unit(x.meaning)]
         ]
         if rows:
-            header = ["metric", "unit", "meaning", "formula", "source", "missing", "better"]
+            header = ["metric", "unit", "better", "definition"]
             text += ["", f"## {section}", "", table(header, rows)]
     rows = [[f"`{x.name}`", f"`{x.of}`", _sentence(x.meaning), _formula(x.formula)] for x in DERIVED]
     text += [
@@ -371,7 +362,18 @@ def metrics() -> str:
     return "\n".join(text) + "\n"
 
 
+def _definition(metric: Any) -> str:
+    """Meaning, formula, source and when it is missing, a line each."""
+    meaning = split_unit(metric.meaning)[1] or metric.name.replace("_", " ")
+    lines = [f"**{_sentence(meaning).rstrip('.')}.**", _formula(metric.formula)]
+    lines += [f"*Source:* {metric.source.rstrip('.')}." if metric.source else ""]
+    lines += [f"*Missing:* {metric.missing}" if metric.missing else ""]
+    return "<br>".join(line for line in lines if line)
+
+
 def _sentence(words: str) -> str:
+    if UNITS.match(words):  # a symbol stays as it is
+        return words
     return words[:1].upper() + words[1:]
 
 
