@@ -142,10 +142,10 @@ def segments(
         rms = max(_rms(off[0]), _rms(off[1]))
         if rms > CONSISTENT:
             _drop(quality, "speeds and positions disagree", (end - begin) * r.dt)
+            place = f"{r.row} {r.line[begin]}, column {r.columns.get('v', 'v')}"
             quality.findings.append(
-                f"line {r.line[begin]}, column {r.columns.get('v', 'v')}: speeds of {_name(r, begin)} behind "
-                f"{r.names[r.leader[begin]]} and their spacing disagree by {rms:.2f} m/s; less than "
-                f"{CONSISTENT:g} m/s would be right"
+                f"{place}: speeds of {_name(r, begin)} behind {r.names[r.leader[begin]]} and their spacing "
+                f"disagree by {rms:.2f} m/s; less than {CONSISTENT:g} m/s is expected"
             )
             continue
         found.append(segment)
@@ -153,7 +153,7 @@ def segments(
     if not found:
         why = ", ".join(f"{reason}: {seconds:.0f} s" for reason, seconds in quality.dropped.items())
         raise RecordingError(
-            f"{r.source}: line {r.line[0]}: nobody follows a leader for {shortest:g} s; of "
+            f"{r.source}: {r.row} {r.line[0]}: nobody follows a leader for {shortest:g} s; of "
             f"{quality.recorded:.0f} s recorded were dropped: {why or 'none'}"
         )
     quality.kept = sum(segment.duration for segment in found)

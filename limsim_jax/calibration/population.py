@@ -51,6 +51,9 @@ WIDTH = 0.3
 IDENTIFIED = 0.5
 """Share of the drivers whose data tell their desired speed, above which those of a population count."""
 
+FEW = 3
+"""Drivers from which on a distribution is estimated."""
+
 _WEIGHT = 4.0
 _HARD = 3.0  # m/s^2, more is no noise but a model that does not fit
 _LAGS = np.arange(0.5, 3.01, 0.5)  # s
@@ -92,9 +95,10 @@ class Law:
 
     @property
     def correlation(self) -> Floats:
-        """Of log-parameters, [P P]."""
+        """Of log-parameters, [P P]; of those without a spread 0."""
         width = np.sqrt(np.diag(self.covariance))
-        return self.covariance / np.outer(width, width)
+        scale = np.where(width > 0, width, 1.0)
+        return np.where(np.eye(len(width)) > 0, 1.0, self.covariance / np.outer(scale, scale))
 
     def sample(self, count: int, rng: np.random.Generator) -> Floats:
         """Parameters of new drivers, `[count P]`, within the box."""
@@ -114,7 +118,7 @@ def estimate(fit: Fit, segments: Sequence[Segment], *, rounds: int = 3, samples:
     Raises:
       ValueError: fewer than three drivers.
     """
-    if len(fit.drivers) < 3:
+    if len(fit.drivers) < FEW:
         raise ValueError(f"a population from {len(fit.drivers)} drivers; at least 3 are needed")
     found = uncertainty(fit, segments, samples=samples)
     identified = found.identified.mean(axis=0)
@@ -146,6 +150,29 @@ def estimate(fit: Fit, segments: Sequence[Segment], *, rounds: int = 3, samples:
         model=fit.model,
         objective=fit.objective,
         residual=residual_process(fit.model, parameters, data, dt),
+    )
+
+
+def few_drivers(fit: Fit, known: Uncertainty, segments: Sequence[Segment]) -> Law:
+    """The law of one or two drivers: their median and spread, nothing of others.
+
+    Args:
+      fit: of the drivers.
+      known: how well the data tell their parameters.
+      segments: those of the fit.
+    """
+    log_p = np.log(fit.parameters)
+    drivers, data, dt = stack(segments)
+    return Law(
+        mean=log_p.mean(axis=0),
+        covariance=np.diag(log_p.var(axis=0)),
+        drivers=drivers,
+        posterior_mean=log_p,
+        posterior_covariance=np.zeros((*log_p.shape, log_p.shape[1])),
+        identified=known.identified.mean(axis=0),
+        model=fit.model,
+        objective=fit.objective,
+        residual=residual_process(fit.model, fit.parameters, data, dt),
     )
 
 
@@ -346,10 +373,7 @@ def write_population(
     classes: Sequence[str] = ("car",),
     speed_limit: float | None = None,
 ) -> None:
-    """Write the population where scenarios take it from: `traffic.drivers = "FILE"`.
-
-    v0 is written only if most drivers' data tell it: relative to the speed limit as `speed_factor` if that
-    is known, else as `v_max`; otherwise the drivers of scenarios keep their default desired speeds.
+    """Write the population as a file for scenarios: `traffic.drivers = "FILE"`.
 
     Args:
       law: of the drivers.
@@ -357,29 +381,61 @@ def write_population(
       sources: names of the recordings.
       classes: vehicle classes that drive like this.
       speed_limit: m/s, of the road of the recordings.
+
+    Raises:
+      ValueError: see `population_content`.
     """
-    names = ["T", "s0", "a", "b"]
-    rename = {}
-    if law.identified[0] > IDENTIFIED:
-        names = ["v0", *names]
-        rename["v0"] = "speed_factor" if speed_limit else "v_max"
+    content = population_content(law, sources=sources, classes=classes, speed_limit=speed_limit)
+    write_whole(path, json.dumps(content, indent=1) + "\n")
+
+
+def population_content(
+    law: Law,
+    *,
+    sources: Sequence[str] = (),
+    classes: Sequence[str] = ("car",),
+    speed_limit: float | None = None,
+) -> dict[str, Any]:
+    """The content of a file of drivers; arguments as of `write_population`.
+
+    v0 is there only if the data of most drivers tell it: relative to the speed limit as `speed_factor` if
+    that is known, otherwise as `v_max`. Without it the drivers of scenarios keep their default desired
+    speeds. Of one or two drivers all parameters are treated like this.
+
+    Raises:
+      ValueError: the data of one or two drivers tell no parameter.
+    """
+    few = len(law.drivers) < FEW
+    names = [
+        name
+        for name, share in zip(PARAMETERS, law.identified, strict=True)
+        if share > IDENTIFIED or (name != "v0" and not few)
+    ]
+    if not names:
+        raise ValueError(
+            f"the data of {len(law.drivers)} drivers tell none of {', '.join(PARAMETERS)}; longer records, "
+            "with free driving, approaches and stops, are needed"
+        )
     at = [PARAMETERS.index(name) for name in names]
     table = {}
     for name, k in zip(names, at, strict=True):
         median, spread = law.median[name], law.spread[name]
         low, high = LOWER[k], UPPER[k]
+        key = name
+        if name == "v0":
+            key = "speed_factor" if speed_limit else "v_max"
         if name == "v0" and speed_limit:
             # speed_factor has a normal distribution: that of the same median and relative width
             median, low, high = (x / speed_limit for x in (median, low, high))
             spread *= median
-        table[rename.get(name, name)] = {
+        table[key] = {
             "median": median,
             "spread": spread,
             "lower": low,
             "upper": high,
             "identified": float(law.identified[k]),
         }
-    content = {
+    return {
         "format": FORMAT,
         "sources": [Path(source).name for source in sources],
         "model": model_name(law.model),
@@ -392,7 +448,15 @@ def write_population(
         "speed_limit": speed_limit,
         "desired_speed": {"median": law.median["v0"], "spread": law.spread["v0"]},
     }
-    write_whole(path, json.dumps(content, indent=1) + "\n")
 
 
-__all__ = ["Law", "Residual", "estimate", "predictive_check", "residual_process", "write_population"]
+__all__ = [
+    "Law",
+    "Residual",
+    "estimate",
+    "few_drivers",
+    "population_content",
+    "predictive_check",
+    "residual_process",
+    "write_population",
+]

@@ -18,6 +18,19 @@ def add_commands(app: typer.Typer) -> None:
 
 def calibrate(
     data: Annotated[list[Path], typer.Argument(metavar="DATA...", help="Recordings of vehicles.")],
+    columns: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FIELD=COLUMN,...",
+            help="Of a CSV or Parquet table of one's own, such as time=t,x_lead=leader,x=follower. Fields: "
+            "time; x, x_lead (positions) or gap; v, v_lead; length_lead; id, id_lead.",
+        ),
+    ] = None,
+    units: Annotated[
+        str | None,
+        typer.Option(metavar="FIELD=UNIT,...", help="Of such a table, if not s, m, m/s: x=ft,v=km/h."),
+    ] = None,
+    length: Annotated[float | None, typer.Option(help="Of the leaders in such a table, m.")] = None,
     model: Annotated[Literal["idm", "iidm", "acc"], typer.Option(help="Car-following model.")] = "idm",
     objective: Annotated[
         Literal["gap", "speed", "mixed", "log", "relative", "absolute"],
@@ -47,7 +60,10 @@ def calibrate(
         Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON.")
     ] = None,
 ) -> None:
-    """Fit car following to recorded drivers: errors, uncertainty and the population they come from."""
+    """Fit car following to recorded drivers: errors, uncertainty and their population.
+
+    limsim-jax calibrate pairs.csv --columns time=t,x_lead=leader,x=follower --length 4.5
+    """
     import json
     from functools import partial
 
@@ -59,26 +75,38 @@ def calibrate(
         single_fits,
     )
     from limsim_jax.calibration.fit import MODELS
+    from limsim_jax.calibration.population import FEW
     from limsim_jax.calibration.report import calibrate as fit
     from limsim_jax.calibration.report import gather
     from limsim_jax.files import write_whole
-    from limsim_jax.recordings import read_recording
+    from limsim_jax.recordings import read_recordings
     from limsim_jax.xla import enable_compilation_cache
 
     check_writable(out, json_file)
     if not 10 <= period < float("inf"):
         raise typer.BadParameter(f"{period:g} s; at least 10", param_hint="--period")
     enable_compilation_cache()
-    recordings = [read_recording(path) for path in data]
+    recordings = read_recordings(
+        data, columns=_pairs(columns, "--columns"), units=_pairs(units, "--units"), length=length
+    )
     linked = linked_recordings(recordings, period=period) if closed_loop else None
     if linked is not None:
         hold_out(linked)  # refuses what has one period only, before anything is fitted
     driven = MODELS[model]
-    found = fit(recordings, model=driven, objective=objective, method=method, shortest=shortest, seed=seed)
+    found = fit(
+        recordings,
+        model=driven,
+        objective=objective,
+        method=method,
+        shortest=shortest,
+        seed=seed,
+        speed_limit=speed_limit,
+    )
     print(found.text())
     result, content = found, found.as_json()
     if linked is not None:
-        _ = found.population  # refuses too few drivers, before the rest is fitted
+        if len(found.fit.drivers) < FEW:  # before the rest is fitted
+            raise ValueError(f"a population from {len(found.fit.drivers)} drivers; at least {FEW} are needed")
         result = calibrate_closed_loop(
             linked,
             gather(recordings, shortest=shortest)[0],
@@ -96,6 +124,17 @@ def calibrate(
         print(f"wrote {out}")
     if json_file is not None:
         write_whole(json_file, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def _pairs(text: str | None, option: str) -> dict[str, str] | None:
+    """Names and values of `name=value,name=value`."""
+    if text is None:
+        return None
+    pairs = [part.partition("=") for part in text.split(",") if part.strip()]
+    for name, sign, value in pairs:
+        if not (name.strip() and sign and value.strip()):
+            raise typer.BadParameter(f"'{name}{sign}{value}'; FIELD=VALUE is expected", param_hint=option)
+    return {name.strip(): value.strip() for name, _, value in pairs}
 
 
 def train(

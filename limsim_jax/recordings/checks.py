@@ -43,7 +43,7 @@ def checked(recording: Recording) -> Recording:
     followers = len(np.unique(recording.vehicle[recording.leader >= 0]))
     if not followers:
         raise RecordingError(
-            f"{recording.source}: line {recording.line[0]}: no vehicle follows another one in this file"
+            f"{recording.source}: {recording.row} {recording.line[0]}: no vehicle follows another one"
         )
     bad = {defect.vehicle for defect in defects if defect.kind != "spacing"}
     if len(bad) > TOLERATED * followers:
@@ -61,7 +61,7 @@ def looks_like_feet(value: float, usual: float = 4.6) -> str:
 def _check_units(r: Recording) -> None:
     def refuse(row: int, field: str, message: str) -> NoReturn:
         raise RecordingError(
-            f"{r.source}: line {r.line[row]}, column {r.columns.get(field, field)}: {message}"
+            f"{r.source}: {r.row} {r.line[row]}, column {r.columns.get(field, field)}: {message}"
         )
 
     for field in ("length", "length_lead"):
@@ -131,8 +131,8 @@ def _defects(r: Recording) -> Iterator[Defect]:
             r.names[r.vehicle[k]],
             int(r.line[k + 1]),
             0,
-            f"line {r.line[k + 1]}, column {column('time')}: {step[k]:.1f} s are missing before this row of "
-            f"vehicle {r.names[r.vehicle[k]]}; steps of {r.dt:g} s are expected",
+            f"{r.row} {r.line[k + 1]}, column {column('time')}: {step[k]:.1f} s are missing before this row "
+            f"of vehicle {r.names[r.vehicle[k]]}; steps of {r.dt:g} s are expected",
         )
     following = r.leader >= 0
     behind = following & (r.x_lead <= r.x)
@@ -149,13 +149,13 @@ def _defects(r: Recording) -> Iterator[Defect]:
                 if kind == "behind" and not gapless
                 else f"{name} overlaps its leader {leader} by {-r.gap[k:end].min():.1f} m; a gap above 0"
             )
+            field = "x_lead" if kind == "behind" and not gapless else "x"
             yield Defect(
                 "spacing" if gapless else kind,
                 name,
                 int(r.line[k]),
                 int(end - k),
-                f"line {r.line[k]}, column {column('x_lead' if kind == 'behind' and not gapless else 'x')}: "
-                f"{what} is expected",
+                f"{r.row} {r.line[k]}, column {column(field)}: {what} is expected",
             )
 
 

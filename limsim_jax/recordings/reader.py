@@ -8,10 +8,14 @@ have here and there (time missing, bodies that overlap, a leader behind its foll
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from limsim_jax.maps.network import MapError
 from limsim_jax.recordings.checks import checked
+from limsim_jax.recordings.columns import example, has_fields, read_columns
 from limsim_jax.recordings.commonroad import read_commonroad, read_commonroad_tracks
 from limsim_jax.recordings.highd import read_highd
 from limsim_jax.recordings.ind import read_ind
@@ -64,9 +68,50 @@ def read_recording(path: str | Path) -> Recording:
     if near & known:
         missing = ", ".join(sorted(near - known))
         raise RecordingError(f"{path}: line 1: column {missing} is missing; found are {', '.join(columns)}")
+    if has_fields(columns):
+        return read_columns(path)
     raise RecordingError(
-        f"{path}: line 1: no recording of a known kind ({KINDS}); its columns are {', '.join(columns)[:200]}"
+        f"{path}: line 1: no recording of a known kind ({KINDS}); found are {', '.join(columns)[:200]}; "
+        f"{example(columns)}"
     )
+
+
+def read_recordings(
+    data: Any,
+    *,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    length: float | None = None,
+) -> list[Recording]:
+    """Recordings of anything that holds followers and leaders.
+
+    Args:
+      data: a file of a known kind, a `Recording`, a table of one's own (see `columns`), or a sequence.
+      columns: of a table of one's own, see `read_columns`.
+      units: likewise.
+      length: likewise, m.
+
+    Raises:
+      RecordingError: what is wrong and where, in one line.
+    """
+    several = isinstance(data, Sequence) and not isinstance(data, (str, bytes))
+    own = columns is not None or units is not None or length is not None
+
+    def read(one: Any) -> Recording:
+        if isinstance(one, Recording):
+            return one
+        if own or not isinstance(one, (str, Path)) or Path(one).suffix.lower() in (".parquet", ".pq"):
+            return read_columns(one, columns=columns, units=units, length=length)
+        return read_recording(one)
+
+    found = [read(one) for one in (data if several else [data])]
+    if several:  # tables have no names that tell their drivers apart
+        found = [
+            replace(one, source=f"data {k}") if one.source == "data" else one for k, one in enumerate(found)
+        ]
+    if not found:
+        raise RecordingError("no recordings; at least one file or table is expected")
+    return found
 
 
 def as_recording(source: Source) -> Recording:
@@ -99,4 +144,4 @@ def _is_xml(data: bytes) -> bool:
     return data[:200].lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
 
 
-__all__ = ["KINDS", "as_recording", "read_recording", "read_tracks"]
+__all__ = ["KINDS", "as_recording", "read_recording", "read_recordings", "read_tracks"]

@@ -66,6 +66,7 @@ class Recording:
     dt: float  # s
     names: tuple[str, ...]  # of vehicles
     columns: Mapping[str, str]  # names in the file of the fields below
+    row: str = "line"  # what a row is called in messages; of a table without lines "row"
     defects: tuple[Defect, ...] = ()
     speed_limit: float = math.nan  # m/s
     line: Ints  # of the file
@@ -109,6 +110,7 @@ def build_recording(
     values: Mapping[str, NDArray[Any]],
     human: bool = True,
     speed_limit: float = math.nan,
+    row: str = "line",
 ) -> Recording:
     """A recording with its rows in order.
 
@@ -120,6 +122,7 @@ def build_recording(
       values: of the `ROWS`, `[R]` each; missing ones are unknown.
       human: followers are driven by humans.
       speed_limit: m/s.
+      row: what a row is called in messages.
 
     Raises:
       RecordingError: see `time_step`.
@@ -131,14 +134,16 @@ def build_recording(
     rows = unknown | dict(values)
     order = np.lexsort((rows["time"], rows["vehicle"]))
     ordered: dict[str, Any] = {name: np.asarray(rows[name])[order] for name in ROWS}
-    dt = time_step(source, columns["time"], ordered["time"], ordered["vehicle"], ordered["line"])
+    dt = time_step(source, columns["time"], ordered["time"], ordered["vehicle"], ordered["line"], row)
     return Recording(
-        source=str(source), kind=kind, human=human, dt=dt, names=names, columns=columns,
+        source=str(source), kind=kind, human=human, row=row, dt=dt, names=names, columns=columns,
         speed_limit=speed_limit, **ordered,
     )  # fmt: skip
 
 
-def time_step(source: str | Path, column: str, time: Floats, vehicle: Ints, line: Ints) -> float:
+def time_step(
+    source: str | Path, column: str, time: Floats, vehicle: Ints, line: Ints, row: str = "line"
+) -> float:
     """Time step of rows that are sorted by vehicle and time, s.
 
     Raises:
@@ -150,16 +155,16 @@ def time_step(source: str | Path, column: str, time: Floats, vehicle: Ints, line
     if twice.any():
         k = int(np.argmax(twice)) + 1
         raise RecordingError(
-            f"{source}: line {max(line[k], line[k - 1])}, column {column}: this vehicle is at t = "
-            f"{time[k]:.2f} s already in line {min(line[k], line[k - 1])}; one row per vehicle "
+            f"{source}: {row} {max(line[k], line[k - 1])}, column {column}: this vehicle is at t = "
+            f"{time[k]:.2f} s already in {row} {min(line[k], line[k - 1])}; one row per vehicle "
             "and time is expected"
         )
     if not same.any():
-        raise RecordingError(f"{source}: line {line[0]}: no vehicle has two rows; trajectories are expected")
+        raise RecordingError(f"{source}: {row} {line[0]}: no vehicle has two rows; trajectories are expected")
     dt = round(float(np.median(steps[same])), 5)
     if not STEPS[0] <= dt <= STEPS[1]:
         raise RecordingError(
-            f"{source}: line {line[0]}, column {column}: steps of {dt:g} s; "
+            f"{source}: {row} {line[0]}, column {column}: steps of {dt:g} s; "
             f"{STEPS[0]:g} to {STEPS[1]:g} s are expected"
         )
     return dt

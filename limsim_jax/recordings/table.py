@@ -42,16 +42,17 @@ def header_of(data: bytes, line: int = 0) -> list[str]:
 class Table:
     """Columns by name, whatever their case; every error names line and column."""
 
-    def __init__(self, source: str | Path, columns: pa.Table, header: int = 1, unit: str = "line") -> None:
+    def __init__(self, source: str | Path, columns: pa.Table, header: int | None = 1) -> None:
         """The columns of a file.
 
         Args:
           source: name of the file, for errors.
           columns: as text or numbers.
-          header: number of the line of the header; rows begin in the next.
-          unit: what rows are called in errors.
+          header: number of the line of the header; rows begin in the next. None: a table without lines,
+            whose rows count from 0.
         """
-        self.source, self.header, self.unit = str(source), header, unit
+        self.source, self.header = str(source), -1 if header is None else header
+        self.row = "row" if header is None else "line"
         self._columns = columns
         self._names = {name.lower(): name for name in columns.column_names}
 
@@ -105,10 +106,13 @@ class Table:
         """As the file has it. Raises `RecordingError` if the column is missing."""
         if column not in self:
             raise RecordingError(
-                f"{self.source}: {self.unit} {self.header}: column {column} is missing; found are "
-                f"{', '.join(self.columns)[:200]}"
+                f"{self._place}: column {column} is missing; found are {', '.join(self.columns)[:200]}"
             )
         return self._names[column.lower()]
+
+    @property
+    def _place(self) -> str:
+        return self.source if self.header < 0 else f"{self.source}: line {self.header}"
 
     def require(self, *columns: str) -> None:
         """Raise `RecordingError` for the first of the columns that is missing."""
@@ -151,7 +155,7 @@ class Table:
     def refuse(self, column: str, row: int, message: str) -> NoReturn:
         """Raise `RecordingError` at a row, counted from 0."""
         raise RecordingError(
-            f"{self.source}: {self.unit} {row + self.header + 1}, column {self.name(column)}: {message}"
+            f"{self.source}: {self.row} {row + self.header + 1}, column {self.name(column)}: {message}"
         )
 
 

@@ -33,16 +33,30 @@ def read_population(path: str | Path, shares: Mapping[str, float] = URBAN) -> Po
       ValueError: one line that names the file and what is wrong with it.
     """
     path = Path(path)
-
-    def refuse(message: str) -> ValueError:
-        return ValueError(f"{path}: {message}")
-
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise refuse(error.strerror or str(error)) from None
+        raise ValueError(f"{path}: {error.strerror or error}") from None
     except ValueError as error:
-        raise refuse(f"not valid JSON: {error}") from None
+        raise ValueError(f"{path}: not valid JSON: {error}") from None
+    return population_of(content, shares, str(path))
+
+
+def population_of(content: Any, shares: Mapping[str, float] = URBAN, source: str = "drivers") -> Population:
+    """The default population with the drivers of the content of a file.
+
+    Args:
+      content: see the module.
+      shares: weight per vehicle class.
+      source: name of the file, for errors.
+
+    Raises:
+      ValueError: one line that says what is wrong with it.
+    """
+
+    def refuse(message: str) -> ValueError:
+        return ValueError(f"{source}: {message}")
+
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise refuse(f"no file of drivers; its 'format' has to be '{FORMAT}'")
     table, classes = content.get("parameters"), content.get("classes")
@@ -88,4 +102,4 @@ def _row(refuse: Any, name: str, row: Any) -> tuple[float, float, float, float]:
     return median, spread, max(low, lower), min(high, upper)
 
 
-__all__ = ["FORMAT", "read_population"]
+__all__ = ["FORMAT", "population_of", "read_population"]

@@ -302,7 +302,10 @@ BAD = {
         edited(lambda lines: [line.rpartition(",")[0].rpartition(",")[0] for line in lines]),
         "line 1: column preceding_vel is missing",
     ),
-    "unknown": ("a,b\n1,2\n", "line 1: no recording of a known kind"),
+    "unknown": (
+        "a,b,c\n1,2,3\n",
+        'found are a, b, c; say which is what, as in --columns "time=a,x_lead=b,x=c"',
+    ),
     "not a number": (put(17, "v_vel", "fast"), "line 17, column v_vel: 'fast'; a finite number"),
     "NaN": (put(30, "local_y", "NaN"), "line 30, column local_y: 'NaN'; a finite number"),
     "no value": (put(31, "preceding_local_y", ""), "line 31, column preceding_local_y: no value"),
