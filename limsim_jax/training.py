@@ -38,22 +38,22 @@ from limsim_jax.types import Config, State
 from limsim_jax.xla import enable_compilation_cache
 
 SCENARIOS = ("highway", "ramp", "intersection", "roundabout", "long_route")
-"""Bundled experiments that are trained on."""
+"""Bundled experiments for training."""
 
 FIRST_SEED = 1_000_000
-"""Worlds to learn from start here: sweeps start at 0 and judge what has not been seen."""
+"""First seed of training; sweeps start at 0, with worlds that the network has not seen."""
 
 
 class Samples(NamedTuple):
-    """What the network learns from, `S` moments; NumPy."""
+    """Training data: `S` moments, as NumPy arrays."""
 
     features: Features  # [S, ...]
-    future: NDArray[np.float32]  # [S, 16, 3], poses that were driven, in the frame of the ego
+    future: NDArray[np.float32]  # [S, 16, 3], driven poses in the frame of the ego
     seed: NDArray[np.int32]  # [S], of the world
 
 
 class Errors(NamedTuple):
-    """Open loop: forecasts against what was driven, over all poses up to 8 s."""
+    """Open-loop errors of forecasts over all poses up to 8 s."""
 
     l1: float  # mean of the absolute errors of x, y (m) and heading (rad)
     ade: float  # m, mean distance
@@ -64,7 +64,7 @@ class Errors(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What training has brought, on seeds that it has not seen."""
+    """Result of training, on held-out seeds."""
 
     samples: int
     held_out: int
@@ -82,7 +82,7 @@ class _Memory(NamedTuple):
 
 @dataclass(frozen=True)
 class _Recorder:
-    """Drives as a policy does, and writes down what the network would see at every decision."""
+    """Drives like a policy, and records the network's inputs at every decision."""
 
     driver: PolicyLike
     decisions: int
@@ -124,7 +124,7 @@ class _Recorder:
         now = state.step // config.decision_every
         egos = state.egos
         pose = jnp.stack([egos.x, egos.y, egos.heading], -1)
-        # who has touched somebody is no example
+        # a vehicle that had a contact is no example
         good = state.active[egos.slot] & (state.status[egos.slot] == 0)
 
         def write(rows: Array, row: Array) -> Array:
@@ -143,7 +143,13 @@ class _Recorder:
 def record(
     experiment: str, seeds: Sequence[int], *, policy: str = "like_traffic", chunk: int = 16
 ) -> Samples:
-    """Moments of rollouts of an experiment (a file or a bundled name), driven by a policy.
+    """Training data from rollouts of an experiment, driven by a policy.
+
+    Args:
+      experiment: a file or a bundled name; its decisions are `POSE_TIME` apart.
+      seeds: of the worlds.
+      policy: name of the policy.
+      chunk: worlds that run at once.
 
     Raises:
       ExperimentError: the experiment cannot be run.
@@ -174,7 +180,7 @@ def record(
 
 
 def _samples(memory: _Memory, seeds: NDArray[Any]) -> Samples:
-    """Moments `[S]` of worlds `[B, D, E]` whose next eight seconds are known."""
+    """Moments `[S]` of worlds `[B, D, E]` with known next eight seconds."""
     pose, active = memory.pose, memory.active
     count = pose.shape[1] - POSES
     now = pose[:, :count, :, None]
@@ -191,7 +197,7 @@ def _samples(memory: _Memory, seeds: NDArray[Any]) -> Samples:
 
 
 def errors(forecast: Any, future: Any) -> Errors:
-    """Of forecast poses `[S, 16, 3]`."""
+    """Errors of forecast poses against driven ones, both `[S, 16, 3]`."""
     off = np.asarray(forecast) - np.asarray(future)
     off[..., 2] = np.remainder(off[..., 2] + np.pi, 2 * np.pi) - np.pi
     apart = np.hypot(off[..., 0], off[..., 1])
@@ -208,7 +214,13 @@ def fit(
     seed: int = 0,
     tell: Callable[[str], None] | None = None,
 ) -> Any:
-    """Weights of `Offset` that have the least L1 error on the samples (Adam, cosine decay)."""
+    """Weights of `Offset` with the least L1 error on the samples.
+
+    Adam with cosine decay of the learning rate.
+
+    Raises:
+      ValueError: there are no samples.
+    """
     import optax
 
     model, count = Offset(hidden), len(samples.future)
@@ -264,9 +276,9 @@ def train(
     Args:
       out: file of the weights, for `PDMHybrid(weights=...)`.
       experiments: files or bundled names; their decisions are 0.5 s apart.
-      policy: who drives in them.
-      seeds: worlds of each to learn from, from `FIRST_SEED` on.
-      held_out: worlds of each to measure with, the seeds after those.
+      policy: name of the policy that drives in them.
+      seeds: training worlds of each, from `FIRST_SEED` on.
+      held_out: held-out worlds of each, the seeds after those.
       hidden: width of the layers; 512 in the paper.
       epochs: passes through the samples.
       chunk: worlds that run at once.
@@ -276,7 +288,7 @@ def train(
       ExperimentError, ValueError: in one line, before anything is trained.
     """
     if seeds < 1 or held_out < 1:
-        raise ValueError(f"{seeds} seeds to learn from and {held_out} to measure with; at least 1 of each")
+        raise ValueError(f"{seeds} seeds to learn from and {held_out} held out; expected at least 1 of each")
     tell = tell or (lambda line: None)
     parts: list[Samples] = []
     for name in experiments:

@@ -1,8 +1,8 @@
-"""Area of Interest: planners for the few vehicles that matter to the egos, IDM and MOBIL for all others.
+"""Area of Interest: planners for the vehicles that matter to the egos, traffic models for all others.
 
-The number of expensive places is fixed, so the cost of a world is, too. Who is planned for changes as the
-egos drive: whoever comes near gets a place, whoever is far gives it up, and the vehicle goes on from where
-it is, at the speed and acceleration that it has.
+The number of planned vehicles, and so the cost of a world, is fixed. As the egos drive, a vehicle that comes
+near gets a place, and a vehicle that is far gives it up. In both cases it continues from its position, at its
+speed and acceleration.
 """
 
 from __future__ import annotations
@@ -24,30 +24,33 @@ from limsim_jax.traffic.engine import Command
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, State, Status
 
-_ASIDE = 0.6  # m off the middle of its lane, from which a vehicle is on its way to or from another one
+_ASIDE = 0.6  # m off the middle of its lane, beyond which a vehicle is between two lanes
 
 
 class Places(NamedTuple):
-    """Memory of the area: `K` places, and the memories of the policies."""
+    """Memory: `K` places, and the memories of the inner policies."""
 
-    slot: Int[Array, " K"]  # who has it, -1: nobody
-    entered: Float[Array, " K"]  # s, when that vehicle entered the world: tells vehicles of a slot apart
-    since: Float[Array, " K"]  # s, when it got the place
-    switches: Int[Array, ""]  # places given to somebody else so far
+    slot: Int[Array, " K"]  # vehicle in the place, -1: none
+    entered: Float[Array, " K"]  # s, when that vehicle entered the world: a slot may get another vehicle
+    since: Float[Array, " K"]  # s, when the vehicle got the place
+    switches: Int[Array, ""]  # changes of places so far
     inner: Any
 
 
 @dataclass(frozen=True)
 class AreaOfInterest(Policy):
-    """Drives the egos, and the vehicles around them that matter most, by planners.
+    """Drives the egos and the most relevant vehicles around them by planners.
 
     Attributes:
-      around: the planner of the vehicles around; it moves them in the plane.
-      ego: the planner of the egos; None: the same one.
+      around: planner of the vehicles around; it moves them in the plane.
+      ego: planner of the egos; None: `around`.
       slots: vehicles beside the egos that can be planned for at a time.
       radius: m from the nearest ego, within which a vehicle gets a place.
-      leave: m, beyond which it gives it up.
-      dwell: s that it keeps a place at least; and as long as it is between two lanes.
+      leave: m, beyond which it gives up its place; None: 1.3 times the radius.
+      dwell: s that it keeps its place at least. Between two lanes it always keeps it.
+
+    Raises:
+      ValueError: a value out of range, or a planner `around` that keeps to lanes.
     """
 
     around: PolicyLike = field(default_factory=LimSimTM)
@@ -59,16 +62,16 @@ class AreaOfInterest(Policy):
 
     def __post_init__(self) -> None:
         if self.slots < 1:
-            raise ValueError(f"slots: {self.slots}; at least 1")
+            raise ValueError(f"slots: {self.slots}; expected at least 1")
         if not self.radius > 0:
-            raise ValueError(f"radius: {self.radius} m; it has to be above 0")
+            raise ValueError(f"radius: {self.radius} m; expected more than 0")
         if self.leave is not None and self.leave < self.radius:
-            raise ValueError(f"leave: {self.leave} m; not less than the radius of {self.radius} m")
+            raise ValueError(f"leave: {self.leave} m; expected at least the radius of {self.radius} m")
         for name in ("around", "ego"):
             if isinstance(getattr(self, name), str):
-                raise ValueError(f"{name}: a policy is expected, such as LimSimTM(), not a name")
+                raise ValueError(f"{name}: expected a policy, such as LimSimTM(), not a name")
         if not self.around.free:
-            raise ValueError("around: a policy that keeps to lanes; it needs one that moves in the plane")
+            raise ValueError("around: this policy keeps to lanes; expected one that moves in the plane")
 
     @property
     def free(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -76,7 +79,7 @@ class AreaOfInterest(Policy):
         return self.ego is None or self.ego.free
 
     def variants(self, seen: Predictor) -> dict[str, PolicyLike]:
-        """With a reference in the place of a module of the egos' planner; who is around keeps its own."""
+        """The variants of the egos' planner; vehicles around keep theirs."""
         policy = self.around if self.ego is None else self.ego
         found = variants(_with_others(policy, 0), seen)
         return {name: replace(self, ego=other) for name, other in found.items()}
@@ -95,14 +98,14 @@ class AreaOfInterest(Policy):
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Places, key: jax.Array
     ) -> tuple[Command, Places]:
-        """Give out the places anew, then plan."""
+        """Assign the places, then plan."""
         now = config.time(state.step)
         places = self._choose(lane_map, state, memory, now)
         count = state.egos.slot.shape[0] - self.slots
         slot = jnp.concatenate([state.egos.slot[:count], places.slot])
         fresh = slot != state.egos.slot
         state = assign(lane_map, state, boxes(lane_map, state), slot)
-        # who is new in a place has no memory
+        # a vehicle that is new in a place has no memory
         begin, rows = self._begin(config, lane_map, state), self._split(fresh)
         inner = tuple(
             renew_rows(policy, mine, new, old)
@@ -112,7 +115,7 @@ class AreaOfInterest(Policy):
         return replace(command, slot=slot), places._replace(inner=inner)
 
     def _parts(self, state: State) -> list[tuple[Any, State]]:
-        """The policies, and the rows of egos that each of them drives."""
+        """The policies, each with the rows of egos that it drives."""
         rows = self._split(state.egos)
         return [(p, replace(state, egos=egos)) for p, egos in zip(self._policies(), rows, strict=True)]
 
@@ -121,7 +124,7 @@ class AreaOfInterest(Policy):
         return [around] if self.ego is None else [self.ego, around]
 
     def _split(self, rows: Any) -> list[Any]:
-        """Arrays of all rows, as those of each policy."""
+        """Arrays of all rows, split by policy."""
         if self.ego is None:
             return [rows]
         egos = jax.tree.map(lambda x: x[: x.shape[0] - self.slots], rows)
@@ -143,7 +146,7 @@ class AreaOfInterest(Policy):
         return _joined(commands[0], commands[1], state.egos), inner
 
     def _choose(self, lane_map: LaneMap, state: State, memory: Places, now: Float[Array, ""]) -> Places:
-        """Who has the places from now on; who keeps one keeps the same."""
+        """The places from now on; a vehicle that keeps its place keeps its row."""
         number = state.lane.shape[0]
         egos = state.egos
         count = egos.slot.shape[0] - self.slots
@@ -156,7 +159,7 @@ class AreaOfInterest(Policy):
         stays = (has & same[None]).any(-1)
         young = (has & (same & (now - memory.since < self.dwell))[None]).any(-1)
 
-        # half a lane change is ended by who began it; who is about to reach its goal leaves by itself
+        # a planner finishes the lane change that it began; near its goal a vehicle leaves by itself
         midway = stays & ((state.side != 0) | (jnp.abs(state.d) > _ASIDE))
         last = lane_map.routes.is_goal[state.lane, state.goal]
         leaving = last & (lane_map.length[state.lane] - state.s < 3.0 * state.v + 10.0)
@@ -190,26 +193,30 @@ class AreaOfInterest(Policy):
 
 
 def _with_others(policy: PolicyLike, count: int) -> PolicyLike:
-    """The policy for so many vehicles beside the egos, if it can drive any."""
+    """The policy for `count` vehicles beside the egos, if it can."""
     if is_dataclass(policy) and any(f.name == "others" for f in fields(policy)):
         return replace(policy, others=count)
     return policy
 
 
 def _joined(first: Command, second: Command, egos: Egos) -> Command:
-    """One command for the rows of both; trajectories on the moments of the second one.
+    """One command for the rows of both.
+
+    Trajectories are at the moments of the second.
 
     Raises:
-      ValueError: a policy that gives no trajectory, though its egos are free.
+      ValueError: a policy with free egos that returns no trajectory.
     """
     much = second.trajectory
     if much is None:
-        raise ValueError("around: a planner that gives no trajectories")
+        raise ValueError("around: this planner returns no trajectories")
     mine = first.trajectory
     rows = egos.slot.shape[0] - much.x.shape[0]
     if mine is None:
         if first.control is not None:
-            raise ValueError("ego: a planner that gives controls cannot be joined with one of trajectories")
+            raise ValueError(
+                "ego: a planner that returns controls cannot be joined with one that returns trajectories"
+            )
         values = [jnp.zeros((rows, much.x.shape[1]), much.x.dtype)] * 4
         meta = None if first.meta is None else jnp.concatenate([first.meta, jnp.full(much.x.shape[0], -1)])
     else:

@@ -74,7 +74,10 @@ class Policy(ABC):
     default_name: ClassVar[str | None] = None
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
-        """The memory at the start, a pytree of arrays whose shapes stay the same; by default nothing."""
+        """The memory at the start: a pytree of arrays of constant shapes.
+
+        By default there is none.
+        """
         del config, lane_map, state
 
     @abstractmethod
@@ -92,10 +95,10 @@ class Policy(ABC):
         """
 
     def memory_rows(self, memory: Any) -> Any:
-        """Which arrays of the memory have one row per ego as their first axis: a tree of bools.
+        """Whether arrays of the memory have one row per ego: a tree of bools.
 
-        `AreaOfInterest` starts a row anew when it gets another vehicle. By default these are all arrays that
-        have an axis; scalars are shared by all egos.
+        Rows are the first axis. `AreaOfInterest` starts a row anew when it gets another vehicle. By default
+        these are all arrays that have an axis; scalars are shared by all egos.
         """
         return rows_by_axis(memory)
 
@@ -172,7 +175,9 @@ def policy_name(policy: Any) -> str:
 
 
 def named(name: str, policy: Any) -> Any:
-    """The same policy under another name, so that one sweep can have two settings of a planner.
+    """The same policy under another name.
+
+    One sweep can then have two settings of a planner.
 
     Raises:
       ValueError: a name with other characters than letters, digits, `_` and `-`.
@@ -213,7 +218,7 @@ def build_policy(factory: Callable[..., PolicyLike], options: Mapping[str, Any])
 
 
 def variants(policy: Any, seen: Predictor) -> dict[str, PolicyLike]:
-    """The policy with a reference in the place of one module, by what the module does.
+    """The policy with one module replaced by a reference, by module.
 
     After a failure each is asked for: a module is to blame if its reference would have avoided the failure. A
     policy made of modules has a method `variants`; of others there are none. `seen` predicts what happened.
@@ -223,7 +228,7 @@ def variants(policy: Any, seen: Predictor) -> dict[str, PolicyLike]:
 
 
 def memory_rows(policy: Any, memory: Any) -> Any:
-    """Which arrays of a policy's memory have one row per ego, see `Policy.memory_rows`."""
+    """Whether arrays of a memory have one row per ego, see `Policy.memory_rows`."""
     found = getattr(policy, "memory_rows", rows_by_axis)(memory)
     return jax.tree.map(lambda mine, part: jax.tree.map(lambda _: mine, part), found, memory)
 
@@ -297,7 +302,7 @@ def check_policy(policy: Any, config: Config, lane_map: LaneMap, state: State) -
 
 
 def _check_command(label: str, command: Command, count: int) -> None:
-    """Raise a `ValueError` if the arrays of a command have other shapes than one row per ego."""
+    """Raise `ValueError` if arrays lack one row per ego."""
     if command.trajectory is not None:
         x = command.trajectory.x
         for name in ("x", "y", "heading", "v"):

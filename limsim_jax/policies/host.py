@@ -1,4 +1,4 @@
-"""Planners outside JAX: any Python, torch or ONNX function, called once per decision for all worlds.
+"""Planners outside JAX: Python, torch or ONNX functions, called once per decision.
 
 A function of NumPy arrays drives the egos of the whole batch, here by pure pursuit and the IDM:
 
@@ -19,14 +19,17 @@ A function of NumPy arrays drives the egos of the whole batch, here by pure purs
     Rollout(config, traffic, horizon=60.0, policy=HostPolicy(follow))
 
 An experiment file names a factory of such a policy as `policy = "package.module:factory"`. Under `vmap` the
-function is called once for all worlds; where a batch is shared among several devices, once for each. It has
-to be a pure function of what it sees: what it wants to remember it gives back as `memory`.
+function is called once for all worlds, and once per device if a batch is spread over several. It must be a
+pure function of its arguments: what it wants to remember, it returns as `memory`.
 """
 
 from __future__ import annotations
 
+import sysconfig
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
@@ -45,17 +48,21 @@ from limsim_jax.types import Config, State
 
 Kind = Literal["control", "trajectory", "meta"]
 
-FAR = 1e6
-"""m to a light where there is none."""
+# where installed code lies, which is not the planner's
+_FOREIGN = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
 
-_LANES = 4  # beyond the own one, for lights
+FAR = 1e6
+"""m to the next light where there is none."""
+
+_LANES = 4  # lanes beyond the own one that are searched for lights
 
 
 class Observation(NamedTuple):
-    """What the egos see, `[B, E]`: `B` worlds, `E` egos, `M` points of the path, `K` others.
+    """What the egos see, `[B, E]`.
 
-    Places are in the frame of the ego: x ahead of the centre of its body, y to the left. Numbers of others
-    that are not `there`, and of rows of egos without a vehicle, mean nothing.
+    `B` worlds, `E` egos, `M` points of the reference path, `K` others. Positions are in the frame of the ego:
+    x ahead of the centre of its body, y to the left. Values of others that are not `there`, and of rows
+    without an ego, have no meaning.
     """
 
     time: Any  # [B], s since the start
@@ -70,7 +77,7 @@ class Observation(NamedTuple):
     light_distance: Any  # m from the front bumper to its stop line, `FAR` if there is none
     to_go: Any  # lanes to cross for the route, left > 0
     to_go_within: Any  # m
-    way_x: Any  # [B, E, M], m, middle of the lane along the route
+    way_x: Any  # [B, E, M], m, reference path: the middle of the lane along the route
     way_y: Any
     way_heading: Any  # rad
     way_limit: Any  # m/s
@@ -85,12 +92,12 @@ class Observation(NamedTuple):
 
 @dataclass(frozen=True)
 class Observe:
-    """Makes an `Observation` of one world.
+    """Makes the `Observation` of one world.
 
     Attributes:
-      nearest: others, `K`.
-      points: of the path, `M`.
-      step: m between them.
+      nearest: number of others, `K`.
+      points: points of the reference path, `M`.
+      step: m between points.
     """
 
     nearest: int = 8
@@ -142,7 +149,7 @@ class Observe:
 
 
 def _next_light(lane_map: LaneMap, state: State) -> tuple[jax.Array, jax.Array]:
-    """What the next light shows, and m to its stop line."""
+    """State of the next light, and m to its stop line."""
     slot = state.egos.slot
     lane, goal = state.lane[slot], state.goal[slot]
     shows = lane_states(lane_map.signals, state.lights.phase)
@@ -159,7 +166,10 @@ def _next_light(lane_map: LaneMap, state: State) -> tuple[jax.Array, jax.Array]:
 
 
 def _empty_road(seen: Any) -> Any:
-    """An observation of these shapes to try a function on: a straight empty road, where that is known."""
+    """An observation of a straight empty road, to try a function on.
+
+    Zeros of the same shapes if the observation is of another kind.
+    """
     zeros = jax.tree.map(lambda x: np.zeros((1, *x.shape), x.dtype), seen)
     if not isinstance(zeros, Observation):
         return zeros
@@ -180,26 +190,28 @@ def _empty_road(seen: Any) -> Any:
 class HostPolicy(Policy):
     """Egos driven by a function on the host.
 
-    `function(seen)` gets what `observe` makes of all worlds, as NumPy arrays with a first axis `B`, and gives
-    back a mapping of arrays, by `command`:
+    `function(seen)` gets what `observe` makes of all worlds, as NumPy arrays with a first axis `B`. It
+    returns a mapping of arrays, by `command`:
 
     - "control": `acceleration` (m/s^2) and `steering` (rad), `[B, E]`, held until the next decision;
     - "trajectory": `x`, `y` (m), `heading` (rad), `v` (m/s), `[B, E, samples]`, of the centre of the body in
       the frame of the ego, every `dt` s from now on;
     - "meta": `meta`, `[B, E]`, whole numbers: `traffic.ego.Meta`, -1: like the traffic.
 
-    With `memory`, it is `function(seen, memory)` with an array `[B, E, memory]`, zeros at the start, and
-    gives back the mapping and the new array. Before anything is compiled it is tried on one empty straight
-    road; what is wrong there is a `ValueError` of one line. What goes wrong later (a number that is not
-    finite) ends the run with a line of the same kind.
+    With `memory` it is `function(seen, memory)` with an array `[B, E, memory]`, zeros at the start, and
+    returns the mapping and the new array.
+
+    Before anything is compiled, the function is tried on one empty straight road. An error there is a
+    `ValueError` of one line; an exception of the function is named with its file and line. Later errors, such
+    as a number that is not finite, end the run with a line of the same kind.
 
     Attributes:
       function: the planner.
-      command: what it gives back.
+      command: kind of what it returns.
       memory: numbers kept for each ego.
       observe: makes a pytree of arrays of one world: `(config, lane_map, state)`.
-      samples: of trajectories.
-      dt: s between them.
+      samples: of a trajectory.
+      dt: s between samples.
     """
 
     function: Callable[..., Any]
@@ -213,9 +225,11 @@ class HostPolicy(Policy):
         if self.command not in get_args(Kind):
             raise ValueError(f"command: '{self.command}'; known are {', '.join(get_args(Kind))}")
         if self.memory < 0:
-            raise ValueError(f"memory: {self.memory} numbers; 0 or more")
+            raise ValueError(f"memory: {self.memory} numbers; expected 0 or more")
         if self.samples < 2 or not self.dt > 0:
-            raise ValueError(f"{self.samples} samples every {self.dt} s; 2 or more, and more than 0 s")
+            raise ValueError(
+                f"{self.samples} samples every {self.dt} s; expected 2 or more, and more than 0 s"
+            )
 
     @property
     def free(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -228,10 +242,10 @@ class HostPolicy(Policy):
         return snake_case(getattr(self.function, "__name__", type(self.function).__name__))
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
-        """Zeros; tries the function first.
+        """Zeros, after the function has been tried.
 
         Raises:
-          ValueError: the function fails, or gives back something else than it should.
+          ValueError: the function raises, or returns something other than it should.
         """
         count = state.egos.slot.shape[0]
         seen = jax.eval_shape(lambda lane_map, state: self.observe(config, lane_map, state), lane_map, state)
@@ -242,7 +256,7 @@ class HostPolicy(Policy):
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
     ) -> tuple[Command, Any]:
-        """Ask the function."""
+        """Call the function."""
         del key
         egos, seen = state.egos, self.observe(config, lane_map, state)
         count = egos.slot.shape[0]
@@ -280,7 +294,7 @@ class HostPolicy(Policy):
         return Command(trajectory=trajectory), memory
 
     def _fields(self) -> dict[str, tuple[int, ...]]:
-        """Names of what the function gives back, and their axes behind `[B, E]`."""
+        """Names of the returned arrays, and their axes after `[B, E]`."""
         if self.command == "control":
             return {"acceleration": (), "steering": ()}
         if self.command == "meta":
@@ -290,26 +304,36 @@ class HostPolicy(Policy):
     def _call(
         self, seen: Any, memory: Any, size: int, count: int, finite: bool = True
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Call the function for `size` worlds and check what comes back."""
+        """Call the function for `size` worlds and check what it returns."""
         name = getattr(self.function, "__qualname__", type(self.function).__qualname__)
         try:
             found = self.function(seen, memory) if self.memory else self.function(seen)
         except Exception as error:
-            raise ValueError(f"{name}: {type(error).__name__}: {error}") from error
+            raise ValueError(f"{_where(error, name)}: {type(error).__name__}: {error}") from error
         if self.memory:
             if not (isinstance(found, tuple) and len(found) == 2):
-                raise ValueError(f"{name}: gives back {_what(found)}, not a mapping and the new memory")
+                raise ValueError(f"{name}: returns {_what(found)}, not a mapping and the new memory")
             found, memory = found
         if not isinstance(found, Mapping) or set(found) != set(self._fields()):
-            raise ValueError(
-                f"{name}: gives back {_what(found)}, not a mapping of {', '.join(self._fields())}"
-            )
+            raise ValueError(f"{name}: returns {_what(found)}, not a mapping of {', '.join(self._fields())}")
         kind = np.int32 if self.command == "meta" else np.float32
         checked: dict[str, np.ndarray] = {}
         for field_, rest in self._fields().items():
             checked[field_] = _checked(name, field_, found[field_], (size, count, *rest), kind, finite)
         shape = (size, count, self.memory)
         return checked, _checked(name, "memory", memory, shape, np.float32, finite)
+
+
+def _where(error: Exception, name: str) -> str:
+    """File, line and function where an exception of the planner was raised.
+
+    The last line of the planner's own code: frames of installed packages and of Python are left out.
+    """
+    frames = traceback.extract_tb(error.__traceback__)[1:]
+    own = [frame for frame in frames if not frame.filename.startswith(_FOREIGN) and frame.filename[:1] != "<"]
+    if not own:
+        return name
+    return f"{Path(own[-1].filename).name}:{own[-1].lineno} in {own[-1].name}"
 
 
 def _what(found: Any) -> str:
@@ -321,7 +345,7 @@ def _what(found: Any) -> str:
 def _checked(
     name: str, field_: str, value: Any, shape: tuple[int, ...], kind: Any, finite: bool
 ) -> np.ndarray:
-    """The array as it should be, or a `ValueError` that says how it is."""
+    """The value as an array of this shape; otherwise a `ValueError`."""
     try:
         array = np.asarray(value)
         numbers = np.issubdtype(array.dtype, np.integer if kind is np.int32 else np.number)

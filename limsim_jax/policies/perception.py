@@ -1,4 +1,4 @@
-"""What planners see: the rules of the road as the traffic engine knows them, and the others around."""
+"""What planners see: right of way by the traffic engine, and the vehicles around."""
 
 from __future__ import annotations
 
@@ -16,27 +16,35 @@ from limsim_jax.traffic.ego import at_slots
 from limsim_jax.traffic.engine import Command, Decision, Traffic, decide
 from limsim_jax.types import Config, State
 
-_NEXT_LANE = 5.0  # m off the path, from which somebody may be changing to it
+_NEXT_LANE = 5.0  # m off the path, within which a vehicle may be changing to it
 
 
 class Around(NamedTuple):
-    """The `K` others that matter to each of `V` vehicles, as seen from its way."""
+    """The `K` most relevant others of `V` vehicles, along their paths."""
 
     slot: Int[Array, "V K"]
     there: Bool[Array, "V K"]
     s: Float[Array, "V K"]  # m from centre to centre along the path
     d: Float[Array, "V K"]  # m off the path
-    gap: Float[Array, "V K"]  # m between bumpers; positive ahead of us and behind us alike
+    gap: Float[Array, "V K"]  # m between bumpers; positive for leaders and followers
     v: Float[Array, "V K"]  # m/s along the path
-    on_way: Bool[Array, "V K"]  # its body is on the lane that the way follows
+    on_path: Bool[Array, "V K"]  # its body is on the lane of the path
 
 
 def rules(
     config: Config, traffic: Traffic, lane_map: LaneMap, state: State, side: Int[Array, " E"]
 ) -> tuple[Int[Array, " E"], Decision]:
-    """What the traffic engine sees: leaders, right of way, lights, ends of lanes; and lane changes by MOBIL.
+    """Decisions of the traffic engine: leaders, right of way, lights, lane changes by MOBIL.
 
-    `side`: lane changes that egos are in the midst of. Returns the lane changes that would begin now.
+    Args:
+      config: steps and look-ahead.
+      traffic: behaviour.
+      lane_map: the map.
+      state: the world now.
+      side: lane changes of the egos in progress: +1 left, -1 right, 0 none.
+
+    Returns:
+      Lane changes that the egos would begin now, and the decision for all vehicles.
     """
     egos = replace(state.egos, free=jnp.zeros_like(state.egos.free))
     now = at_slots(egos, side, state.side, side != 0)
@@ -48,7 +56,7 @@ def rules(
 def around(
     state: State, prediction: Prediction, path: ReferencePath, slot: Int[Array, " V"], count: int
 ) -> Around:
-    """The others that come nearest within the next seconds, and where they are on the path."""
+    """The `count` others that come nearest within the prediction, along the path."""
     number = state.lane.shape[0]
     x, y = prediction.x, prediction.y  # [N H]
     mine = jnp.arange(number)[None] == slot[:, None]
@@ -69,10 +77,10 @@ def around(
         jnp.abs(jnp.cos(turned)) * state.shape.width[index]
         + jnp.abs(jnp.sin(turned)) * state.shape.length[index]
     )
-    on_way = (
+    on_path = (
         there & (jnp.abs(d) < half / 2 + state.shape.width[slot][:, None] / 2 + 0.1) & (jnp.cos(turned) > 0.3)
     )
     joins = there & (state.side[index] * jnp.sign(d).astype(jnp.int32) < 0) & (jnp.abs(d) < _NEXT_LANE)
-    on_way = (on_way | joins) & (jnp.abs(s) < path.reach)
+    on_path = (on_path | joins) & (jnp.abs(s) < path.reach)
     lengths = (state.shape.length[index] + state.shape.length[slot][:, None]) / 2
-    return Around(index, there, s, d, jnp.abs(s) - lengths, state.v[index] * jnp.cos(turned), on_way)
+    return Around(index, there, s, d, jnp.abs(s) - lengths, state.v[index] * jnp.cos(turned), on_path)

@@ -1,9 +1,9 @@
-"""Where others will be: predictions of all vehicles as arrays, for planners to keep clear of.
+"""Predictions: positions of all vehicles at later moments, as arrays.
 
-A `Predictor` is a function; a planner takes any. Here are: `along_route` along the route, `constant_velocity`
-along the heading, as in PDM (Dauner et al., CoRL 2023), and `Replayed`, what came to pass. They take over
-what planned vehicles let others know, see `shared`. `hypotheses` has several futures of a vehicle where lanes
-split. Without gradient through which lane a vehicle is on.
+A `Predictor` is a function; planners take any. `along_route` keeps the speed and follows the true route,
+`constant_velocity` keeps speed and heading, as in PDM (Dauner et al., CoRL 2023). `Replayed` is the recorded
+future. All use the plans that planned vehicles share, see `shared`. `hypotheses` has several futures of a
+vehicle where lanes split. There is no gradient through the choice of the lane.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SETTLE = 3.0
 """s in which the offset of a vehicle that changes no lanes fades to the middle of its lane."""
 
 STOPPING = 2.0
-"""m/s^2, braking before a place to stop, or what it takes if that is more."""
+"""m/s^2, braking before a stop; harder if that is needed."""
 
 _LANES = 4  # lanes beyond the own one that are looked at
 _STRAYED = 2.0  # m, along x or y
@@ -37,7 +37,7 @@ _STRAYED = 2.0  # m, along x or y
 
 @struct.dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """Where the bodies of `N` vehicles are expected at `H` moments."""
+    """Predicted positions of the bodies of `N` vehicles at `H` moments."""
 
     x: Float[Array, "N H"]  # m, centre of the body
     y: Float[Array, "N H"]
@@ -49,7 +49,7 @@ class Prediction:
 
 @struct.dataclass(frozen=True, kw_only=True)
 class Hypotheses:
-    """Several predictions of each vehicle, `M`, and how likely they are."""
+    """`M` predictions of each vehicle, with their probabilities."""
 
     x: Float[Array, "N M H"]  # m, centre of the body
     y: Float[Array, "N M H"]
@@ -62,9 +62,9 @@ class Hypotheses:
 
 @struct.dataclass(frozen=True, kw_only=True)
 class Plans:
-    """What planned vehicles let others know: where `V` of them will be at the times of a prediction."""
+    """Shared plans: positions of `V` planned vehicles at the times of a prediction."""
 
-    slot: Int[Array, " V"]  # -1: nobody's plan
+    slot: Int[Array, " V"]  # -1: no plan
     x: Float[Array, "V H"]  # m, centre of the body
     y: Float[Array, "V H"]
     heading: Float[Array, "V H"]  # rad
@@ -82,9 +82,14 @@ class Predictor(Protocol):
         stop: Float[Array, " N"] | None = None,
         plans: Plans | None = None,
     ) -> Prediction:
-        """Where all vehicles will be `times` s from now.
+        """Positions of all vehicles `times` s from now.
 
-        `stop`: m ahead of each front bumper beyond which the vehicle will not go; `plans` override.
+        Args:
+          lane_map: the map.
+          state: the world now.
+          times: s from now.
+          stop: m from each front bumper to where the vehicle will stop.
+          plans: known plans, which replace predictions.
         """
         ...
 
@@ -98,10 +103,10 @@ def along_route(
     stop: Float[Array, " N"] | None = None,
     plans: Plans | None = None,
 ) -> Prediction:
-    """Everybody goes on along its route at its speed; lane changes in progress finish.
+    """All vehicles follow their routes at their speeds, and finish lane changes.
 
-    Off the middle of its lane a vehicle returns there within `SETTLE` s. Before a place to `stop` it brakes
-    with `STOPPING`, or what it takes. Routes of more than five lanes within the times end straight on.
+    An offset from the middle of the lane fades within `SETTLE` s. Before a `stop` a vehicle brakes with
+    `STOPPING`, or harder if needed. Beyond the fifth lane of a route the prediction goes straight on.
     """
     start = _start(lane_map, state)
     rows, begins = _route(lane_map, state, start.lane)
@@ -120,7 +125,7 @@ def constant_velocity(
     stop: Float[Array, " N"] | None = None,
     plans: Plans | None = None,
 ) -> Prediction:
-    """Everybody goes straight on at its speed. `stop` as in `along_route`."""
+    """All vehicles keep speed and heading; `stop` as in `along_route`."""
     box = boxes(lane_map, state)
     distance, _ = _travelled(state, times, stop)
     heading = jnp.broadcast_to(box[:, 2:3], distance.shape)
@@ -143,17 +148,17 @@ def shared(
     now: Float[Array, ""],
     times: Float[Array, " H"],
 ) -> Plans:
-    """Where the vehicles in these slots will be that go on with the trajectories they have chosen before.
+    """Plans of vehicles that go on with their previous trajectories.
 
-    They do so from where they are now. Who is more than `_STRAYED` m off its trajectory by now, or inactive,
-    follows it no longer: nothing is known of it.
+    Positions continue from where the vehicle is now. A vehicle that is inactive, or more than `_STRAYED` m
+    off its trajectory, has no plan.
 
     Args:
-      lane_map: where.
+      lane_map: the map.
       state: the world now.
-      slot: whose trajectories they are; -1: nobody's.
+      slot: vehicles of the trajectories; -1: none.
       trajectory: of `V` rows; far away where there is none.
-      now: s.
+      now: s, present time.
       times: s from now.
     """
     box = boxes(lane_map, state)[slot, :3]
@@ -167,14 +172,14 @@ def shared(
 
 @dataclass(frozen=True)
 class Replayed:
-    """What came to pass: a predictor for worlds that run a second time.
+    """The recorded future: a predictor for worlds that run a second time.
 
-    Each vehicle moves as it did in the first run, from where it is now. A slot that another vehicle took
-    meanwhile goes on with that one's motion.
+    Each vehicle moves as in the first run, from where it is now. If another vehicle took its slot meanwhile,
+    the prediction continues with that vehicle's motion.
 
     Attributes:
-      box: `[T, N, 5]` of the first run as in `rollout.Trace`, after every physics step.
-      dt: s from one to the next.
+      box: `[T, N, 5]` of the first run as in `Trace`, after every physics step.
+      dt: s between physics steps.
     """
 
     box: Float[Array, "T N 5"]
@@ -189,7 +194,7 @@ class Replayed:
         stop: Float[Array, " N"] | None = None,
         plans: Plans | None = None,
     ) -> Prediction:
-        """Where all vehicles were `times` s later; `stop` is not needed."""
+        """Positions of all vehicles `times` s later; `stop` is not needed."""
         del stop
         last = self.box.shape[0] - 1
         now = state.step - 1  # the first row is after the first step
@@ -214,21 +219,25 @@ def hypotheses(
     known: float | None = None,
     stop: Float[Array, " N"] | None = None,
 ) -> Hypotheses:
-    """What everybody may do at the next split of lanes: one prediction per successor there.
+    """One prediction per successor at the next split of lanes.
 
     Beyond the split a vehicle that leaves its route takes the first successor of each lane.
 
     Args:
-      lane_map: where.
+      lane_map: the map.
       state: the world now.
       times: s from now.
-      modes: `M`; successors beyond that many are left out.
-      known: probability of the way that the route takes, and the rest in equal shares; None: nobody knows
-        the route, so all successors are equally likely.
+      modes: `M`; further successors are left out.
+      known: probability of the successor on the route, the others share the rest equally; None: the route is
+      not
+        known, and all successors are equally likely.
       stop: as in `along_route`, for all of them.
+
+    Raises:
+      ValueError: `known` is not within 0 and 1.
     """
     if known is not None and not 0 <= known <= 1:
-        raise ValueError(f"known: a probability of {known}; it must be within 0 and 1")
+        raise ValueError(f"known: {known}; expected a probability within 0 and 1")
     start = _start(lane_map, state)
     route, _ = _route(lane_map, state, start.lane)
     count = (lane_map.successors != NO_LANE).sum(-1)
@@ -271,10 +280,10 @@ def hypotheses(
 def nearest(
     lane_map: LaneMap, state: State, prediction: Prediction, slot: Int[Array, " V"], k: int
 ) -> Int[Array, "V K"]:
-    """Slots of the `k` others that come nearest to each of these vehicles, -1 where there are fewer.
+    """Slots of the `k` others that come nearest to each vehicle.
 
-    By the least distance of the predicted centres at one of the times less what the bodies reach. Vehicles
-    of another level (bridges) and inactive ones do not count.
+    -1 stands for none. Distance is the least between predicted centres at one time, less half the other's
+    length. Vehicles on another level (bridges) and inactive ones do not count.
     """
     n = state.active.shape[0]
     apart = (prediction.x[slot][:, None] - prediction.x[None]) ** 2
@@ -293,7 +302,7 @@ def nearest(
 
 
 class _Start(NamedTuple):
-    """Where everybody is on the lane that it is on, or changes to."""
+    """Positions on the own lane, or on the target lane."""
 
     lane: Int[Array, " N"]
     s: Float[Array, " N"]  # m, centre of the body; negative on the lane before
@@ -309,7 +318,7 @@ def _start(lane_map: LaneMap, state: State) -> _Start:
 
 
 def _route(lane_map: LaneMap, state: State, lane: Int[Array, " N"]) -> tuple[Array, Array]:
-    """The lanes from this one on along the routes, and where they begin, m from its start `[N D]`."""
+    """Lanes along the routes, and m to their starts; `[N D]`."""
     rows = [lane]
     begins = [jnp.zeros_like(state.s)]
     for _ in range(_LANES):
@@ -322,7 +331,7 @@ def _route(lane_map: LaneMap, state: State, lane: Int[Array, " N"]) -> tuple[Arr
 def _travelled(
     state: State, times: Float[Array, " H"], stop: Float[Array, " N"] | None
 ) -> tuple[Float[Array, "N H"], Float[Array, "N H"]]:
-    """m that everybody has travelled by then, and the speed, m/s."""
+    """Distances travelled by then, m, and speeds, m/s."""
     v, t = state.v[:, None], times[None, :]
     if stop is None:
         return v * t, jnp.broadcast_to(v, (v.shape[0], times.shape[0]))
@@ -345,7 +354,7 @@ def _along(
 ) -> tuple[Float[Array, "N H"], Float[Array, "N H"], Float[Array, "N H"]]:
     distance, v = _travelled(state, times, stop)
     at = start.s[:, None] + distance
-    # lanes of the route count from the start of the first one; before it lies the one it came from
+    # lanes of the route count from the start of the first; before it is the previous lane
     begins = begins - begins[:, :1]
     which = jnp.maximum(jnp.sum(begins[:, None, :] <= at[:, :, None], -1) - 1, 0)
     lane = jnp.take_along_axis(rows, which, -1)
@@ -356,7 +365,7 @@ def _along(
     behind = (s < 0) & (came != NO_LANE)
     lane, s = jnp.where(behind, came, lane), jnp.where(behind, s + lane_map.length[came], s)
 
-    # lane changes go on by the clock; what else is off the middle fades
+    # lane changes proceed with time; other offsets fade
     rate = safe_divide(jnp.minimum(state.v / CREEP_SPEED, 1), state.driver.lane_change_time)
     changes = start.changes[:, None]
     u = jnp.where(changes, state.progress[:, None], 0)
@@ -370,7 +379,7 @@ def _along(
 
 
 def _with(prediction: Prediction, plans: Plans | None) -> Prediction:
-    """The prediction, where somebody's plan is known that plan."""
+    """The prediction, replaced by plans where they are known."""
     if plans is None or plans.slot.shape[0] == 0:
         return prediction
     mine = plans.slot[:, None] == jnp.arange(prediction.x.shape[0], dtype=plans.slot.dtype)[None, :]

@@ -22,7 +22,7 @@ from limsim_jax.xla import interval
 
 @struct.dataclass(frozen=True, kw_only=True)
 class ReferencePath:
-    """Ways of `V` vehicles: `M` points each, `step` m apart along the lanes of their routes."""
+    """Paths of `V` vehicles: `M` points, `step` m apart along the lanes of their routes."""
 
     x: Float[Array, "V M"]  # m
     y: Float[Array, "V M"]
@@ -32,7 +32,7 @@ class ReferencePath:
     left: Float[Array, "V M"]  # m from the middle of the lane to the edge of the roadway, both > 0
     right: Float[Array, "V M"]
     lane: Int[Array, "V M"]
-    end: Float[Array, " V"]  # m to where the route leaves these lanes; beyond it a way goes straight on
+    end: Float[Array, " V"]  # m to where the route leaves these lanes; beyond it the path is straight
     step: float = struct.field(pytree_node=False)
 
     @property
@@ -63,7 +63,7 @@ class ReferencePath:
 
 
 class Frenet(NamedTuple):
-    """Motion along and across a way, at its first point."""
+    """Motion along and across a path, at its first point."""
 
     s: Float[Array, " V"]  # m
     v: Float[Array, " V"]  # m/s along
@@ -86,17 +86,17 @@ def path_from(
     lanes: int = 5,
     after: Int[Array, " V"] | None = None,
 ) -> ReferencePath:
-    """Ways from `s` (m) on `lane` along the route to `goal`.
+    """Paths from `s` on `lane` along the route to `goal`.
 
     Args:
-      lane_map: where.
-      lane: rows of the lane map; NO_LANE gives a harmless way.
-      s: arc length of the first point.
+      lane_map: the map.
+      lane: rows of the lane map; NO_LANE gives a path without meaning, but with finite numbers.
+      s: m, arc length of the first point.
       goal: columns of the route table.
-      points: of each way.
+      points: of each path.
       step: m between points.
-      lanes: lanes beyond the first that are looked at; the last one goes straight on at its end.
-      after: lane after the first one, where known: the front is on it already; else NO_LANE.
+      lanes: lanes beyond the first; after the last the path is straight.
+      after: the lane after the first, where the front is already on it; otherwise NO_LANE.
     """
     routes = lane_map.routes
     ids, starts, end = [lane], [-s], jnp.full_like(s, 1e6)
@@ -157,7 +157,7 @@ def reference_path(
 
 
 def center_lane(lane_map: LaneMap, state: State, slot: Int[Array, " V"]) -> tuple[Array, Array]:
-    """Lane and arc length (m) of the centres of the bodies in these slots."""
+    """Lane and arc length (m) of the centres of these bodies."""
     return body_place(
         lane_map, state.lane[slot], state.previous[slot], state.s[slot], state.shape.length[slot]
     )
@@ -170,9 +170,10 @@ def beside(
     d: Float[Array, " V"],
     side: Int[Array, " V"],
 ) -> tuple[Int[Array, " V"], Float[Array, " V"], Float[Array, " V"], Bool[Array, " V"]]:
-    """A place as seen from the lane to the left (`side` 1) or right (-1): lane, s, d, and if there is one.
+    """A position in coordinates of an adjacent lane.
 
-    Without such a lane, or with `side` 0, the place stays as it is.
+    The lane to the left (`side` 1) or right (-1). Returns lane, s, d, and whether there is such a lane.
+    Otherwise, and with `side` 0, nothing changes.
     """
     other, _ = neighbor(lane_map, lane, side)
     there = (side != 0) & (other != NO_LANE)
@@ -187,9 +188,11 @@ def beside(
 
 
 def motion_on(path: ReferencePath, state: State, slot: Int[Array, " V"], d: Float[Array, " V"]) -> Frenet:
-    """How the vehicles in these slots move along and across their ways, `d` m off their first points.
+    """Motion of vehicles along and across their paths.
 
-    Free egos by their heading in the plane, the others by the progress of their lane change.
+    They are `d` m off the first points.
+
+    Free egos move by their heading in the plane, the others by the progress of their lane change.
     """
     v, a, egos = state.v[slot], state.a[slot], state.egos
     astray, steered = jnp.zeros_like(v), path.curvature[:, 0]
@@ -214,7 +217,7 @@ def motion_on(path: ReferencePath, state: State, slot: Int[Array, " V"], d: Floa
 
 
 class Place(NamedTuple):
-    """The plane at places on a way; shapes as those of the places."""
+    """Points in the plane; shapes as of the positions on the path."""
 
     x: Float[Array, ...]  # m
     y: Float[Array, "*b"]
@@ -223,9 +226,9 @@ class Place(NamedTuple):
 
 
 def to_cartesian(path: ReferencePath, s: Float[Array, "V ..."], d: Float[Array, "V ..."]) -> Place:
-    """Cartesian place `s` m along and `d` m left of each way: a cubic Hermite curve between its points.
+    """Cartesian position `s` m along and `d` m left of each path.
 
-    Beyond its last point a way goes straight on, before its first one straight back.
+    Between its points a path is a cubic Hermite curve; before the first and beyond the last it is straight.
     """
     flat = (s.shape[0], -1)
     s_, d_ = s.reshape(flat), jnp.broadcast_to(d, s.shape).reshape(flat)
@@ -256,10 +259,10 @@ def to_cartesian(path: ReferencePath, s: Float[Array, "V ..."], d: Float[Array, 
 def project_onto(
     path: ReferencePath, x: Float[Array, "V ..."], y: Float[Array, "V ..."]
 ) -> tuple[Float[Array, "V ..."], Float[Array, "V ..."], Float[Array, "V ..."]]:
-    """Where places are on each way: m along, m left of it, and the heading of the way there, rad.
+    """Positions relative to each path: s and d (m), and the path's heading (rad).
 
-    Level with the nearest points of the path, so exact on straights and to half a step squared times the
-    curvature in bends.
+    Relative to the nearest point: exact on straights, and to half a step squared times the curvature in
+    bends.
     """
     flat = (x.shape[0], -1)
     x_, y_ = x.reshape(flat), y.reshape(flat)

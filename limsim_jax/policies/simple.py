@@ -1,4 +1,4 @@
-"""Policies to compare others with."""
+"""Simple policies for comparison."""
 
 from __future__ import annotations
 
@@ -20,14 +20,19 @@ from limsim_jax.types import Config, State
 
 @dataclass(frozen=True)
 class ConstantSpeed(Policy):
-    """Steers along its route at one speed and minds nobody: how dangerous is it not to look?
+    """Steers along its route at one speed.
+
+    It ignores other vehicles and lights: how dangerous is it not to look?
 
     Steering by the pure-pursuit law (Coulter 1992, CMU-RI-TR-92-01): the arc through the point of the lane
     `look_ahead` s ahead.
 
     Attributes:
-      speed: m/s; None: the one that it starts with.
+      speed: m/s; None: the initial speed.
       look_ahead: s.
+
+    Raises:
+      ValueError: a negative speed, or no look-ahead.
     """
 
     speed: float | None = None
@@ -35,9 +40,9 @@ class ConstantSpeed(Policy):
 
     def __post_init__(self) -> None:
         if self.speed is not None and not self.speed >= 0:
-            raise ValueError(f"speed: {self.speed} m/s; it has to be 0 or more")
+            raise ValueError(f"speed: {self.speed} m/s; expected 0 or more")
         if not self.look_ahead > 0:
-            raise ValueError(f"look_ahead: {self.look_ahead} s; it has to be above 0")
+            raise ValueError(f"look_ahead: {self.look_ahead} s; expected more than 0")
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         """The speed to keep."""
@@ -48,13 +53,13 @@ class ConstantSpeed(Policy):
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
     ) -> tuple[Command, Any]:
-        """Steer to the point ahead, hold the speed."""
+        """Steer to the point ahead and hold the speed."""
         del key
         egos, slot = state.egos, state.egos.slot
         wheelbase = state.shape.wheelbase[slot]
         v, lane, goal = state.v[slot], state.lane[slot], state.goal[slot]
         reach = jnp.maximum(self.look_ahead * v, 4.0)
-        # the place ahead along the route, two lane ends deep
+        # the point ahead along the route, up to two lanes on
         there, s = lane, state.s[slot] - state.shape.length[slot] / 2 + reach
         for _ in range(2):
             after = lane_map.routes.next_lane[there, goal]
@@ -73,13 +78,15 @@ class ConstantSpeed(Policy):
 
 @dataclass(frozen=True)
 class FollowLane(Policy):
-    """Drives in the plane what traffic drives on its lane: car following, right of way, no lane changes.
+    """Drives in the plane as the traffic model does on its lane.
 
-    For comparisons: whatever differs from `LikeTraffic` comes from moving in the plane.
+    It changes no lanes.
+
+    For comparison: differences from `LikeTraffic` are due to moving in the plane.
 
     Attributes:
       others: vehicles of the traffic that it can drive beside the egos.
-      traffic: rules of the road, and how drivers follow each other.
+      traffic: right of way and car following.
     """
 
     others: int = 0
@@ -88,7 +95,7 @@ class FollowLane(Policy):
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
     ) -> tuple[Command, Any]:
-        """The acceleration of the traffic model, held along the middle of the lane for two seconds."""
+        """The traffic model's acceleration along the lane, held for two seconds."""
         del key
         slot = state.egos.slot
         _, decision = rules(config, self.traffic, lane_map, state, jnp.zeros_like(slot))

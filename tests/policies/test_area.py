@@ -166,7 +166,7 @@ def test_traffic_is_the_same_with_the_area_driven_like_traffic():
 
 
 def test_options_that_make_no_sense_are_refused():
-    with pytest.raises(ValueError, match="slots: 0; at least 1"):
+    with pytest.raises(ValueError, match="slots: 0; expected at least 1"):
         AreaOfInterest(FollowLane(), slots=0)
     with pytest.raises(ValueError, match="radius"):
         AreaOfInterest(FollowLane(), radius=0.0)

@@ -144,7 +144,7 @@ def test_the_same_policy_under_another_name_does_the_same(policy):
 def test_simulations_are_those_of_the_search():
     assert LimSimTM(simulations=7).settings == dataclasses.replace(LimSimTM().settings, simulations=7)  # pyright: ignore[reportArgumentType]
     assert LimSimTM(search=None, simulations=7).settings is None
-    with pytest.raises(ValueError, match="simulations: 0; at least 1"):
+    with pytest.raises(ValueError, match="simulations: 0; expected at least 1"):
         LimSimTM(simulations=0)
 
 

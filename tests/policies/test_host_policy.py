@@ -185,8 +185,8 @@ def gives(found, **more):
 @pytest.mark.parametrize(
     "policy, message",
     [
-        (gives(None), "gives back NoneType, not a mapping of acceleration, steering"),
-        (gives({"steering": 0}), "gives back a mapping of steering, not a mapping of acceleration, steering"),
+        (gives(None), "returns NoneType, not a mapping of acceleration, steering"),
+        (gives({"steering": 0}), "returns a mapping of steering, not a mapping of acceleration, steering"),
         (gives({"acceleration": 0.0, "steering": 0.0}), r"acceleration has shape \[\], not .* \[1, 1\]"),
         (
             gives({"meta": np.zeros((1, 1))}, command="meta"),
@@ -196,14 +196,33 @@ def gives(found, **more):
             gives({"acceleration": "fast", "steering": 0}),
             "acceleration is str of .*, not an array of numbers",
         ),
-        (gives({}, memory=1), "gives back a mapping of , not a mapping and the new memory"),
-        (HostPolicy(lambda seen: 1 / 0), "ZeroDivisionError: division by zero"),
+        (gives({}, memory=1), "returns a mapping of , not a mapping and the new memory"),
+        (
+            HostPolicy(lambda seen: 1 / 0),
+            r"^test_host_policy.py:\d+ in <lambda>: ZeroDivisionError: division by zero$",
+        ),
+        (
+            HostPolicy(lambda seen: np.linalg.inv(np.zeros((2, 3)))),
+            r"^test_host_policy.py:\d+ in <lambda>: LinAlg",
+        ),
     ],
 )
 def test_what_is_wrong_is_said_before_anything_is_compiled(policy, message):
     with pytest.raises(ValueError, match=message) as caught:
         policy.init(CONFIG, bundled("highway")[1], world(20.0, 10.0))
     assert "\n" not in str(caught.value)
+
+
+def test_an_exception_names_the_line_of_the_planner_that_raised_it():
+    def helper(seen):
+        raise RuntimeError("no plan")
+
+    line = helper.__code__.co_firstlineno + 1
+    with pytest.raises(
+        ValueError, match=f"^test_host_policy.py:{line} in helper: RuntimeError: no plan$"
+    ) as caught:
+        HostPolicy(lambda seen: helper(seen)).init(CONFIG, bundled("highway")[1], world(20.0, 10.0))
+    assert isinstance(caught.value.__cause__, RuntimeError)
 
 
 def test_bad_options_are_named():

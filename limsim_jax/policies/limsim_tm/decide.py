@@ -1,8 +1,8 @@
-"""From the road to the search and back: groups, their corridors, and what each vehicle is to do next.
+"""Maneuvers by search: groups of vehicles, their corridors, and the search in each.
 
-A group is decided on the corridor of its first member: the lanes beside its own, `LANES` in all, with
-everybody's place along and across its way. Where paths cross, the rules of the road decide; they reach the
-search as places to stop.
+A group is searched on the corridor of its first member: `LANES` lanes around its own, with the positions of
+all vehicles along and across its path. Where paths cross, the right of way decides; it enters the search as
+positions to stop at.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.types import State
 
 LANES = 5
-"""Lanes of a corridor; the own lane is the one in the middle."""
+"""Lanes of a corridor; the own lane is in the middle."""
 
 _MIDDLE = LANES // 2
-_NEAR = 60.0  # m, within which somebody who is not planned for may be taken into a group
-_FAR_AWAY = 1e3  # m off the path: of no interest
+_NEAR = 60.0  # m, within which a vehicle that is not planned for may join a group
+_FAR_AWAY = 1e3  # m off the path, for vehicles to be ignored
 
 
 class Maneuvers(NamedTuple):
-    """What `V` vehicles are to do until the next search."""
+    """Maneuvers of `V` vehicles until the next search."""
 
-    side: Int[Array, " V"]  # +1: change to the left, -1: to the right, 0: stay
+    side: Int[Array, " V"]  # lane change: +1 left, -1 right, 0 none
     v: Float[Array, "V H"]  # m/s, at the moments of the search
     action: Int[Array, "V D"]  # `Meta`
 
 
 class Corridor(NamedTuple):
-    """Where `V` vehicles may go from their lanes; lanes counted to the left."""
+    """Lanes that `V` vehicles may change to, counted to the left."""
 
-    left: Int[Array, " V"]  # lanes that it may change to on the left, at most `_MIDDLE`
+    left: Int[Array, " V"]  # lanes on the left that it may change to, at most `_MIDDLE`
     right: Int[Array, " V"]
-    wanted_left: Int[Array, " V"]  # the leftmost lane that leads on, relative to the own one
+    wanted_left: Int[Array, " V"]  # the leftmost lane that leads to the goal, relative to the own one
     wanted_right: Int[Array, " V"]
-    to_go: Float[Array, " V"]  # m until it must be in one that leads on
+    to_go: Float[Array, " V"]  # m until it must be in one that leads to the goal
 
 
 def corridor(
@@ -54,7 +54,7 @@ def corridor(
     goal: Int[Array, " V"],
     vehicle_class: Array,
 ) -> Corridor:
-    """Lanes beside vehicles at `s` (m), and which of them lead to their goals."""
+    """Lanes beside vehicles, and those that lead to their goals; `s` in m."""
     routes = lane_map.routes
     found, wanted, room = [], [], []
     own = routes.lanes_to_go[lane, goal]
@@ -102,10 +102,10 @@ def grouped(
     near: Int[Array, "V K"],
     counts: Bool[Array, "V K"],
 ) -> Int[Array, "V G"]:
-    """Slots of the vehicles that decide together, -1 for none; every planned vehicle is in one group.
+    """Slots of the vehicles of each group, -1 for none; every planned vehicle is in one.
 
-    Groups are made of planned vehicles that interact. Places that are left go to others nearby, `near` where
-    it `counts`: what they will do is then found out along with the rest.
+    Groups consist of planned vehicles that interact. Free places go to other vehicles nearby (`near` where it
+    `counts`), whose maneuvers are then searched together with the rest.
     """
     c = group.Vehicles(
         active=drives, lane=jnp.where(drives, lane, NO_LANE), s=state.s[slot], v=state.v[slot],
@@ -141,10 +141,18 @@ def scene(
     side: Int[Array, " N"],
     wall: Float[Array, " N"],
 ) -> search.Scene:
-    """The corridor of one group, along the path `[1 M]` of its first member.
+    """The search problem of one group.
 
-    `prediction` is at the moments of the search; `lane`: of the centres of all bodies; `side`: lane changes
-    under way; `wall`: m to where each must stop.
+    Args:
+      lane_map: the map.
+      state: the world now.
+      member: slots of the group, -1 for none.
+      path: of the first member, `[1 M]`; the corridor runs along it.
+      near: slots of other vehicles, -1 for none.
+      prediction: at the moments of the search.
+      lane: of the centres of all bodies.
+      side: lane changes in progress.
+      wall: m to where each vehicle must stop.
     """
     everybody = jnp.concatenate([member, jnp.where((near[:, None] == member[None]).any(-1), -1, near)])
     x, y = prediction.x[everybody], prediction.y[everybody]  # [G+K H]
@@ -209,7 +217,7 @@ def decide_maneuvers(
     previous: Int[Array, "V D"],
     key: Key[Array, ""],
 ) -> Maneuvers:
-    """Search in all groups, and what that means for the planned vehicles in `slot`."""
+    """Maneuvers of the vehicles in `slot`, by a search in every group."""
     row_of = lambda which: jnp.argmax(slot[None] == which[:, None], -1)  # noqa: E731
     first = row_of(members[:, 0])
 
@@ -224,7 +232,7 @@ def decide_maneuvers(
 
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(members.shape[0]))
     plans, lanes = jax.vmap(one)(members, first, keys)
-    # each planned vehicle finds itself in one of the groups
+    # every planned vehicle is in exactly one group
     flat = members.reshape(-1)
     place = jnp.argmax(flat[None] == slot[:, None], -1)
     found = (flat[None] == slot[:, None]).any(-1) & (slot >= 0)
@@ -241,7 +249,7 @@ def decide_maneuvers(
 def neighbours(
     gap: Float[Array, "V K"], d: Float[Array, "V K"], there: Bool[Array, "V K"]
 ) -> Bool[Array, "V K"]:
-    """Which of those around may be asked into a group: the two nearest on the own lane and beside it."""
+    """Vehicles around that may join a group: the two nearest on and beside the own lane."""
     close = there & (jnp.abs(d) < 5.5) & (gap < _NEAR)
     best = lax.top_k(jnp.where(close, -gap, -NO_GAP), min(group.SIZE - 1, gap.shape[1]))[0][:, -1:]
     return close & (-gap >= best)

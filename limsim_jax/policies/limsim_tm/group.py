@@ -1,4 +1,4 @@
-"""Who decides together: pairs of vehicles that interact, and groups of fixed size made of them.
+"""Groups of vehicles that decide together: interacting pairs, and groups of fixed size.
 
 The rules and their constants are those of LimSim's decision maker (Wen et al., LimSim, IEEE ITSC 2023).
 """
@@ -17,10 +17,10 @@ SIZE = 3
 """Vehicles in a group."""
 
 _JUNCTION = 20.0  # m between vehicles, one of them in a junction
-_TIME = 3.5  # s: how far the rear one looks to the one ahead
+_TIME = 3.5  # s of the follower's speed, within which it interacts with its leader
 _BESIDE = 2.0  # m, added to both lengths for vehicles side by side
 
-_NEVER = 1e9  # score of whoever may not be chosen
+_NEVER = 1e9  # score of vehicles that may not be chosen
 
 
 class Vehicles(NamedTuple):
@@ -33,7 +33,7 @@ class Vehicles(NamedTuple):
     length: Float[Array, " V"]  # m
     x: Float[Array, " V"]  # m
     y: Float[Array, " V"]  # m
-    wish: Int[Array, " V"]  # +1 wants to the left, or is on the way there, -1 to the right, 0 neither
+    wish: Int[Array, " V"]  # wanted or current lane change: +1 left, -1 right, 0 none
     # of its lane
     lane_length: Float[Array, " V"]  # m
     successors: Int[Array, "V C"]  # lane indices, `NO_LANE` for none
@@ -43,11 +43,11 @@ class Vehicles(NamedTuple):
 
 
 def interactions(vehicles: Vehicles) -> Bool[Array, "V V"]:
-    """Pairs that interact; symmetric, nobody with himself.
+    """Pairs of vehicles that interact; symmetric, the diagonal is False.
 
-    Two vehicles interact within 20 m of each other if one is in a junction; in one lane, or a lane and its
-    successor, with a gap of less than 3.5 s of the rear one plus its length; and side by side if one wants
-    to the lane of the other.
+    Two vehicles interact if they are within 20 m of each other and one is in a junction; if they are in one
+    lane, or in a lane and its successor, with a gap of less than 3.5 s at the follower's speed plus its
+    length; or if they are side by side and one wants to change to the lane of the other.
     """
     c = vehicles
     away = jnp.hypot(c.x[:, None] - c.x[None], c.y[:, None] - c.y[None])
@@ -55,7 +55,7 @@ def interactions(vehicles: Vehicles) -> Bool[Array, "V V"]:
 
     known = (c.lane != NO_LANE)[None]
     same = (c.lane[:, None] == c.lane[None]) & known
-    front_to_front = c.s[None] - c.s[:, None]  # how far j is before i
+    front_to_front = c.s[None] - c.s[:, None]  # m that j is ahead of i
     reach = (_TIME * c.v + c.length)[:, None]
     follows = same & (front_to_front >= 0) & (front_to_front - c.length[None] < reach)
     onto = (c.successors[:, :, None] == c.lane[None, None]).any(1) & known
@@ -78,16 +78,16 @@ def group(
     groups: int,
     size: int = SIZE,
 ) -> Int[Array, "groups size"]:
-    """Form groups, greedily: the first free vehicle by `score`, then its neighbours, then theirs.
+    """Form groups greedily: the first free vehicle by `score`, its neighbors, then theirs.
 
-    Each vehicle is in one group at most, and in exactly one if there are as many groups as vehicles; one
-    that interacts with nobody who is free is alone in its group.
+    Each vehicle is in one group at most, and in exactly one if there are as many groups as vehicles. A
+    vehicle that interacts with no free vehicle is alone in its group.
 
     Args:
       interacts: pairs, symmetric.
-      score: lower goes first, such as the distance to the ego; less than 1e9, equal ones by index.
-      active: who is to be grouped.
-      groups: how many.
+      score: lower comes first, such as the distance to the ego; below 1e9, ties by index.
+      active: vehicles to be grouped.
+      groups: number of groups.
       size: vehicles per group.
 
     Returns:
@@ -95,7 +95,7 @@ def group(
     """
 
     def choose(free: Array, of: Array) -> tuple[Array, Array]:
-        """The best of the free ones, or -1; who is free after that."""
+        """The best free vehicle or -1, and those still free after that."""
         best = jnp.argmin(jnp.where(of & free, score, _NEVER)).astype(jnp.int32)
         found = jnp.where((of & free).any(), best, -1)
         return found, free & (jnp.arange(free.shape[0]) != found)

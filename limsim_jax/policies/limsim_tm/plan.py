@@ -1,9 +1,9 @@
-"""Trajectories along a path: a lattice of speeds, horizons and offsets, of which the cheapest is taken.
+"""Trajectory planning along a path: the cheapest sample of a lattice.
 
-Werling, Ziegler, Kammel, Thrun (ICRA 2010): quartics and quintics in time along the path; across it
-quintics over the distance driven, so that also slow vehicles can follow them. Among the samples are always
-car following with several desired speeds, and braking, mild and as hard as possible: some trajectory is
-drivable in any case.
+The lattice combines speeds, horizons and offsets (Werling, Ziegler, Kammel, Thrun, ICRA 2010). Along the path
+samples are quartics and quintics in time. Across it they are quintics over the distance driven, which slow
+vehicles can follow, too. Car following with several desired speeds and braking (mild and as hard as possible)
+are always among the samples, so that at least one is drivable.
 """
 
 from __future__ import annotations
@@ -25,57 +25,60 @@ from limsim_jax.xla import computed_once, interval, mapped_like
 class Task(NamedTuple):
     """What `V` vehicles have ahead of them."""
 
-    path: ReferencePath  # the one to follow: of the own lane or of the one to change to
+    path: ReferencePath  # of the own lane, or of the target lane of a lane change
     start: Frenet
     length: Float[Array, " V"]  # m
     width: Float[Array, " V"]
     driver: Driver  # [V]
-    lead_gap: Float[Array, "V J"]  # m from the front bumper to who is to be followed; NO_GAP: nobody
+    lead_gap: Float[Array, "V J"]  # m from the front bumper to each leader; NO_GAP: none
     lead_v: Float[Array, "V J"]  # m/s
-    lead_a: Float[Array, "V J"]  # m/s^2; who brakes is taken to go on braking
-    wall: Float[Array, " V"]  # m from the front bumper to the place beyond which it must not go
+    lead_a: Float[Array, "V J"]  # m/s^2; a braking leader is assumed to keep braking
+    wall: Float[Array, " V"]  # m from the front bumper to the stop obstacle
     other: Others
     merge: Merge
-    wanted: Float[Array, "V H"]  # m/s, speed that was decided on; fast where nothing was
+    wanted: Float[Array, "V H"]  # m/s, speed that the search chose; very high without a search
     steering: Float[Array, " V"]  # rad, largest while driving; with `wheelbase` it bounds the curvature
     wheelbase: Float[Array, " V"]
 
 
 class Others(NamedTuple):
-    """Where `K` others will be at the `H` moments of the plan, for each of `V` vehicles."""
+    """Predictions of `K` others for `V` vehicles, at `H` moments."""
 
     x: Float[Array, "V K H"]  # m
     y: Float[Array, "V K H"]
     heading: Float[Array, "V K H"]  # rad
     length: Float[Array, "V K"]  # m
     width: Float[Array, "V K"]
-    counts: Bool[Array, "V K"]  # False: is none of our business
+    counts: Bool[Array, "V K"]  # False: ignored
 
 
 class Merge(NamedTuple):
-    """Traffic on the lane that the route needs next, to which the vehicle adapts its speed."""
+    """Traffic on the lane that the route needs next.
+
+    The vehicle adapts its speed to it.
+    """
 
     s: Float[Array, "V K"]  # m from centre to centre along the path, now
     v: Float[Array, "V K"]  # m/s
     length: Float[Array, "V K"]  # m
     there: Bool[Array, "V K"]
-    urgency: Float[Array, " V"]  # 0: needs no other lane, 1: must change now
+    urgency: Float[Array, " V"]  # 0: no lane change needed, 1: must change now
 
 
 class Plan(NamedTuple):
-    """The trajectories that were chosen, from now on; the centre of the body."""
+    """The chosen trajectories of the centres of the bodies, from now on."""
 
     x: Float[Array, "V H"]  # m
     y: Float[Array, "V H"]
     heading: Float[Array, "V H"]  # rad, of the motion
     v: Float[Array, "V H"]  # m/s
     cost: Float[Array, " V"]
-    sample: Int[Array, " V"]  # number of the sample that was chosen
-    safe: Bool[Array, " V"]  # no bound is broken and nobody is touched
+    sample: Int[Array, " V"]  # index of the chosen sample
+    safe: Bool[Array, " V"]  # no bound is broken, and there is no contact
 
 
 class Samples(NamedTuple):
-    """All trajectories of the lattice: `S` samples at `H` moments, and what speaks against them."""
+    """All trajectories of the lattice with their costs: `S` samples at `H` moments."""
 
     s: Float[Array, "V S H"]  # m
     d: Float[Array, "V S H"]  # m
@@ -85,7 +88,7 @@ class Samples(NamedTuple):
     v: Float[Array, "V S H"]  # m/s
     curvature: Float[Array, "V S H"]  # 1/m
     cost: Float[Array, "V S"]
-    broken: Float[Array, "V S"]  # how much bounds are broken; 0 for what is feasible
+    broken: Float[Array, "V S"]  # excess over the bounds; 0: feasible
 
 
 @dataclass(frozen=True)
@@ -97,12 +100,12 @@ class Lattice:
       dt: s between moments.
       speeds: end speeds of the quartics, between a standstill and the desired speed.
       horizons: s in which they are reached.
-      stops: durations of stops at the wall, as multiples of that with constant deceleration, or of moving up
-        to it from a standstill.
+      stops: durations of stops at the stop obstacle, as multiples of the duration with constant
+        deceleration, or of moving up to it from a standstill.
       following: desired speeds of the car-following samples, as shares.
       braking: m/s^2, constant; the hardest is the driver's `b_max`.
       offsets: m off the middle of the path at the end.
-      distances: over which each of them is reached, as a share of the usual distance.
+      distances: over which each offset is reached, as a share of the usual distance.
       lateral_time: s for a change of offset, at driving speed.
     """
 
@@ -130,7 +133,7 @@ class Lattice:
 
     @property
     def moments(self) -> int:
-        """Samples in time, now and the end of the horizon among them."""
+        """Number of moments, from now to the end of the horizon."""
         return round(self.horizon / self.dt) + 1
 
     def times(self) -> Float[Array, " H"]:
@@ -139,20 +142,20 @@ class Lattice:
 
 
 _BROKEN = 1e3  # cost of a broken bound, per unit of excess
-_TOUCH = 5e3  # cost of touching somebody at once; later ones count less, with this time constant:
-_FORGET = 2.0  # s
+_TOUCH = 5e3  # cost of an immediate contact
+_FORGET = 2.0  # s, time constant with which later contacts count less
 _MARGIN = 0.5  # m kept ahead of and behind others
 _SIDE = 0.25  # m kept beside others
 _REACTION = 0.5  # s at the present speed before braking hard (RSS)
-_RSS_UNTIL = 1.5  # s; later there will be another plan
-_APPROACH = 0.6  # of the comfortable deceleration: slows down for bends and limits ahead
-_STOPPING, _STOPPING_LATE = 0.8, 1.5  # of it: stops at lines, and at the end of a lane that it has to leave
-_ONSET = 1.0  # s in which that braking sets in
+_RSS_UNTIL = 1.5  # s; beyond that another plan will be in force
+_APPROACH = 0.6  # share of the comfortable deceleration, before bends and speed limits
+_STOPPING, _STOPPING_LATE = 0.8, 1.5  # shares of it: at stop lines; at the end of a lane to be left
+_ONSET = 1.0  # s in which this braking builds up
 _MERGE_BRAKING = 2.0  # m/s^2
 _STRETCH = 30.0  # m
-_HURRY = 2.5  # times the weight of efficiency
-_SLOW = 3.0  # m/s, below which there is some of this hurry, too: queues move up
-_AT_LAST = 0.3  # weight of speeding at the end of the horizon: it would have to be braked off after that
+_HURRY = 2.5  # factor of the weight of efficiency before a required lane change
+_SLOW = 3.0  # m/s, below which the factor grows, too, so that queues move up
+_AT_LAST = 0.3  # extra weight of speeding at the end of the horizon: braking would have to follow
 _MOVE_UP = 10 / 3**0.5  # a quintic from rest to rest takes sqrt(this * distance / its greatest acceleration)
 _MIN_LATERAL = 10.0  # m, least distance in which the offset changes
 _ROLLING = 1.5  # m/s, below which the wheels can be turned before the vehicle has moved much
@@ -161,9 +164,10 @@ _ROLLING = 1.5  # m/s, below which the wheels can be turned before the vehicle h
 def quartic(
     v0: Array, a0: Array, v1: Array, end: Array | float, t: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Distance, speed, acceleration and jerk of the quartic that reaches `v1` without acceleration at `end`.
+    """Quartic in time from one speed to another.
 
-    From speed `v0` and acceleration `a0`; after `end` on at that speed. SI units.
+    From speed `v0` and acceleration `a0` to speed `v1` at `end`, without acceleration there. It keeps `v1`
+    after `end`. Returns distance, speed, acceleration and jerk at `t`, in SI units.
     """
     dv, da = v1 - v0 - a0 * end, -a0
     a3 = (3 * dv - da * end) / (3 * end**2)
@@ -179,9 +183,9 @@ def quartic(
 def quintic(
     x0: Array, v0: Array, a0: Array, x1: Array, v1: Array | float, a1: Array | float, end: Array, t: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """The quintic between two points with given derivatives, `end` apart, at `t`; and its derivatives.
+    """Quintic between two points with given derivatives, `end` apart.
 
-    After `end` it stays at `x1` if `v1` is 0.
+    Returns its value and three derivatives at `t`. After `end` it stays at `x1` if `v1` is 0.
     """
     d0, d1, d2 = x1 - x0 - v0 * end - a0 / 2 * end**2, v1 - v0 - a0 * end, a1 - a0
     a3 = (10 * d0 - 4 * d1 * end + d2 / 2 * end**2) / end**3
@@ -197,9 +201,9 @@ def quintic(
 
 
 def speed_envelope(task: Task) -> Float[Array, "V M"]:
-    """Fastest speed at every points of the path, m/s, from which all that comes is met by braking mildly.
+    """Highest speed at every point of the path, m/s.
 
-    Speed limits, bends and the wall.
+    From it, mild braking suffices for all speed limits, bends and the stop obstacle ahead.
     """
     path, driver = task.path, task.driver
     fastest = jnp.minimum(driver.speed_factor[:, None] * path.limit, driver.v_max[:, None])
@@ -213,15 +217,19 @@ def speed_envelope(task: Task) -> Float[Array, "V M"]:
 
 
 def _stopping(task: Task) -> Float[Array, " V"]:
-    """Braking at the wall, m/s^2; who still has to find a gap does not lose the speed of those it joins."""
+    """Braking before the stop obstacle, m/s^2.
+
+    A vehicle that still has to merge brakes late, to keep the speed of the traffic that it joins.
+    """
     return task.driver.b * jnp.where(task.merge.urgency > 0, _STOPPING_LATE, _STOPPING)
 
 
 def leaders(task: Task, t: Float[Array, "*#b"]) -> tuple[Float[Array, "*b J"], Float[Array, "*b J"]]:
-    """How far the leaders are `t` s from now, m from the front bumper now, and their speeds, m/s.
+    """Distance (m) and speed (m/s) of the leaders `t` s from now.
 
-    At constant speed, or at constant deceleration to a standstill (constant-acceleration heuristic: Kesting,
-    Treiber, Helbing, Phil. Trans. R. Soc. A 368, 2010).
+    Distances count from where the front bumper is now. Leaders keep their speed, or brake at constant
+    deceleration to a standstill (constant-acceleration heuristic: Kesting, Treiber, Helbing, Phil. Trans. R.
+    Soc. A 368, 2010).
     """
     shape = (task.lead_v.shape[0],) + (1,) * (t.ndim - 1) + (task.lead_v.shape[1],)
     gap, v, a = (x.reshape(shape) for x in (task.lead_gap, task.lead_v, task.lead_a))
@@ -231,9 +239,9 @@ def leaders(task: Task, t: Float[Array, "*#b"]) -> tuple[Float[Array, "*b J"], F
 
 
 def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
-    """All samples of the lattice for every vehicle, with their costs: each motion along with each offset.
+    """All samples of the lattice with their costs: each motion along the path with each offset.
 
-    What depends on the motion along the path alone is worked out once for all offsets.
+    Terms that depend on the motion along the path alone are computed once for all offsets.
     """
     envelope = speed_envelope(task)
     s, v, a, jerk = _along(lattice, model, task, envelope)  # [V A H]
@@ -257,7 +265,7 @@ def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
         turned / stretch
     )
     speed = v[:, :, None] * stretch / turned
-    # the costs use them over and over
+    # used many times by the costs
     d, bend, x, y, cos, sin, curvature, speed = computed_once((d, bend, x, y, cos, sin, curvature, speed))
     cost, broken, room = _costs_along(lattice, task, envelope, s, v, a, jerk)
     more, worse = _costs_across(lattice, task, room, d, x, y, cos, sin, speed, curvature, bend)
@@ -274,9 +282,11 @@ def sample(lattice: Lattice, model: CarFollowing, task: Task) -> Samples:
 
 
 def _first_bend(task: Task, goal: Array, end: Array) -> Float[Array, "V O 1"]:
-    """Second derivative, 1/m, with which samples begin that are `goal` off the path after `end`, m.
+    """Second derivative of the offset at the start of samples, 1/m.
 
-    That of the present motion. Who stands can turn the wheels first: like a cubic, as far as they turn.
+    Samples reach the offset `goal` after `end` (m). They begin with the present curvature of the motion. A
+    stopped vehicle can turn its wheels first, so that its samples begin like a cubic, within the steering
+    limit.
     """
     d, slope, bend, here, v, most = (
         x[:, None, None]
@@ -290,7 +300,7 @@ def _first_bend(task: Task, goal: Array, end: Array) -> Float[Array, "V O 1"]:
 
 
 def _tightest(task: Task) -> Float[Array, " V"]:
-    """Largest curvature, 1/m: the last of the lock is kept for who stands or rolls."""
+    """Largest curvature, 1/m; the full lock is for stopped or rolling vehicles."""
     more = 1 + 0.2 * jnp.clip(1 - task.start.v / _ROLLING, 0, 1)
     return more * jnp.tan(task.steering) / task.wheelbase
 
@@ -314,7 +324,7 @@ def plan(lattice: Lattice, model: CarFollowing, task: Task) -> Plan:
 
 
 def _fastest(task: Task, envelope: Float[Array, "V M"]) -> Float[Array, " V"]:
-    """The highest speed that is allowed anywhere on the next stretch, m/s."""
+    """Highest allowed speed within the next `_STRETCH` m, m/s."""
     return jnp.max(envelope[:, : max(2, int(_STRETCH / task.path.step))], -1)
 
 
@@ -324,7 +334,7 @@ def _along(
     """Motion along the path `[V A H]`: m, m/s, m/s^2, m/s^3."""
     start, t = task.start, lattice.times()[None, None]
     v0, a0 = start.v[:, None, None], jnp.clip(start.a, -8.0, 4.0)[:, None, None]
-    # end speeds from a standstill to the fastest that is allowed where it would be then
+    # end speeds from a standstill to the highest that is allowed ahead
     top = _fastest(task, envelope)
     share = jnp.linspace(0.0, 1.0, lattice.speeds)
     parts = []
@@ -332,12 +342,12 @@ def _along(
         reach = jnp.minimum(top, start.v + 1.5 * end)[:, None]
         low = jnp.maximum(start.v - 3.0 * end, 0)[:, None]
         parts.append(quartic(v0, a0, (low + share[None] * (reach - low))[:, :, None], end, t))
-        # as fast as the next leader, or as now
+        # the speed of the nearest leader, or the present speed
         behind = jnp.where(task.lead_gap < NO_GAP / 2, task.lead_v, start.v[:, None])
         first = jnp.take_along_axis(behind, jnp.argmin(task.lead_gap, -1)[:, None], 1)
         parts.append(quartic(v0, a0, first[:, :, None], end, t))
     parts.append(quartic(v0, a0, v0, 2.0, t))
-    # stops at the wall
+    # stops at the stop obstacle
     distance = jnp.maximum(task.wall, 0.05)[:, None, None]
     move_up = jnp.sqrt(_MOVE_UP * distance / task.driver.a[:, None, None])
     stop = jnp.minimum(2 * distance / jnp.maximum(v0, 0.5), move_up)
@@ -362,7 +372,7 @@ def _along(
 
 
 def _late_stop(lattice: Lattice, task: Task) -> tuple[Array, Array, Array, Array]:
-    """On at the present speed as long as that is all right, then to a stop at the wall."""
+    """Keep the present speed as long as possible, then stop."""
     t, v0 = lattice.times()[None], task.start.v[:, None]
     room = jnp.maximum(task.wall[:, None] - v0 * _ONSET / 2, 0.1)
     b = jnp.clip(v0 * v0 / (2 * room), _stopping(task)[:, None], task.driver.b_max[:, None])
@@ -381,7 +391,10 @@ def _late_stop(lattice: Lattice, task: Task) -> tuple[Array, Array, Array, Array
 def _follow(
     lattice: Lattice, model: CarFollowing, task: Task, envelope: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Car following behind all leaders and before the wall, with several shares of the desired speed."""
+    """Car following behind all leaders, with several shares of the desired speed.
+
+    The stop obstacle counts as a standing leader.
+    """
     start, path, dt = task.start, task.path, lattice.dt
     driver = jax.tree.map(lambda x: x[:, None, None], task.driver)
     share = jnp.asarray(lattice.following, start.v.dtype)[None]
@@ -401,7 +414,7 @@ def _follow(
         wish = model(
             driver, gap=gap, v=v[..., None], v_lead=ahead, a_lead=jnp.zeros_like(gap), v0=v0[..., None]
         ).min(-1)
-        wish = jnp.clip(wish, a - 6.0 * dt, a + 3.0 * dt)  # the drive train follows no steps
+        wish = jnp.clip(wish, a - 6.0 * dt, a + 3.0 * dt)  # the drive train limits the jerk
         new = jnp.maximum(v + wish * dt, 0)
         return (s + (v + new) / 2 * dt, new, wish), (s, v, wish, (wish - a) / dt)
 
@@ -414,7 +427,10 @@ def _follow(
 def _costs_along(
     lattice: Lattice, task: Task, envelope: Array, s: Array, v: Array, a: Array, jerk: Array
 ) -> tuple[Float[Array, "V A"], Float[Array, "V A"], tuple[Float[Array, "V A H"], Float[Array, "V A H"]]]:
-    """Cost of every motion along the path, by how much it breaks bounds, and the room left and right, m."""
+    """Costs of all motions along the path.
+
+    Returns cost, excess over bounds, and the room to the left and right, m.
+    """
     path, driver, t = task.path, task.driver, lattice.times()[None, None]
     each = lambda value: value[:, None, None]  # noqa: E731
     flat = (s.shape[0], -1)
@@ -424,20 +440,20 @@ def _costs_along(
         low, high = jnp.take_along_axis(table, k, 1), jnp.take_along_axis(table, k + 1, 1)
         return (low + jnp.clip(u, 0, 1) * (high - low)).reshape(s.shape)
 
-    # against one speed for all samples: who gets to where more is allowed must not look slower for it
+    # relative to one speed for all samples: reaching a higher speed limit must not raise the cost
     slow = jnp.maximum(each(_fastest(task, envelope)) - v, 0)
     over = jnp.maximum(v - along(envelope), 0)
     far, lead_v = leaders(task, t)
     gap = jnp.minimum(far - s[..., None], NO_GAP)  # [V A H J]
-    # the gap that IDM wants, which grows with the speed at which one comes nearer
+    # the IDM's desired gap, which grows with the approach rate
     approach = v[..., None] - lead_v
     dynamic = each(driver.T)[..., None] + approach / (2 * jnp.sqrt(each(driver.a * driver.b)))[..., None]
     wanted = each(driver.s0)[..., None] + jnp.maximum(v[..., None] * dynamic, 0)
     close = jnp.maximum(1 - gap / wanted, 0).max(-1)
-    # who joins others is best as fast as they are, and who moves up is followed by others
+    # merging vehicles should match the traffic's speed, and queues should move up
     slowly = jnp.clip(1 - task.start.v / _SLOW, 0, 1)
     hurry = jnp.where(task.merge.urgency > 0, _HURRY, 1.0 + (_HURRY - 1.0) * slowly)[:, None]
-    # who would have to brake after the end of the horizon brakes now
+    # braking that would be needed after the horizon counts now
     closing = jnp.maximum(approach[:, :, -1], 0)
     remaining = jnp.maximum(gap[:, :, -1] - driver.s0[:, None, None], 0.1)
     later = jnp.minimum(closing * closing / (2 * remaining), driver.b_max[:, None, None]).max(-1)
@@ -475,9 +491,9 @@ def _costs_across(
     curvature: Array,
     bend: Array,
 ) -> tuple[Float[Array, "V A O"], Float[Array, "V A O"]]:
-    """What offsets, bends and others add to the cost and to the breach of bounds; all are `[V A O H]`.
+    """Cost and excess over bounds due to offsets, bends and other vehicles.
 
-    `cos` and `sin` are those of the heading.
+    Arrays are `[V A O H]`; `cos` and `sin` are those of the heading.
     """
     each = lambda value: value[:, None, None, None]  # noqa: E731
     tightest = each(_tightest(task))
@@ -486,7 +502,7 @@ def _costs_across(
     half = each(task.width) / 2
     edge = jnp.zeros_like(d)
     for side, free in zip((1.0, -1.0), room, strict=True):
-        # who is out there already may come back, and who points there may turn first
+        # a vehicle that is over the edge may return, and one that points there may turn first
         out = jnp.maximum(side * d + half - free[:, :, None], 0)
         turning = jnp.maximum(side * each(task.start.slope), 0) ** 2 / tightest
         edge = jnp.maximum(edge, out - jnp.maximum(out[..., :1], 0.05) - turning)
@@ -513,10 +529,16 @@ def room_needed(
     braking: Float[Array, "*#b"] | float,
     headway: Float[Array, "*#b"] | float = 0.3,
 ) -> Float[Array, "*#b"]:
-    """Gap, m, that a lane change must leave between somebody at `v` and somebody ahead at `v_ahead`, m/s.
+    """Gap (m) that a lane change needs between follower and leader.
 
-    To react, to brake to the other's speed with `braking`, m/s^2, and for a short `headway`, s, after that,
-    which the other makes by itself if it is faster.
+    Room to react, to brake to the leader's speed, and for a short headway after that. A faster leader opens
+    this headway by itself.
+
+    Args:
+      v: speed of the follower, m/s.
+      v_ahead: speed of the leader, m/s.
+      braking: m/s^2 that the follower brakes with.
+      headway: s.
     """
     faster = jnp.maximum(v - v_ahead, 0)
     short = jnp.maximum(headway * v - jnp.maximum(v_ahead - v, 0), 0)
@@ -524,9 +546,9 @@ def room_needed(
 
 
 def _no_gap(task: Task, s: Array, v: Array, t: Array) -> Float[Array, "V A H"]:
-    """How far the vehicle is from a gap in the traffic that it has to join: 0 level with one that will do.
+    """Shortfall of the gap beside the vehicle, before a merge.
 
-    It will do if who comes from behind, or we, can brake to the other's speed with `_MERGE_BRAKING`.
+    It is 0 if the follower in each pair can brake to its leader's speed with `_MERGE_BRAKING`.
     """
     merge, missing = task.merge, jnp.zeros_like(s)
     for k in range(merge.s.shape[1]):
@@ -544,9 +566,9 @@ def _no_gap(task: Task, s: Array, v: Array, t: Array) -> Float[Array, "V A H"]:
 def _meet(
     task: Task, x: Array, y: Array, cos: Array, sin: Array
 ) -> tuple[Float[Array, "V A O H"], Float[Array, "V A O H"]]:
-    """Whether others are touched, 0 or 1, and how near they come beside, 0 to 1.
+    """Contact (0 or 1) and proximity beside the vehicle (0 to 1).
 
-    The other's box as seen along our axes, with room around: at most a little too large.
+    Boxes are compared along the axes of the vehicle, with a margin: slightly conservative.
     """
     each = lambda value: value[:, None, None, None]  # noqa: E731
     at_times = lambda value: value[:, None, None]  # noqa: E731
@@ -565,7 +587,7 @@ def _meet(
         near = jnp.maximum(near, jnp.where(level, jnp.clip(1 - aside, 0, 1), 0))
         return (touch, near), None
 
-    # one after the other: unrolled, XLA would work out the places of all samples anew for each
+    # a loop over the others: unrolled, XLA would compute the positions of all samples again for each
     other = task.other
     cos_k, sin_k = jnp.cos(other.heading), jnp.sin(other.heading)
     each_of = (other.x, other.y, cos_k, sin_k, other.length, other.width, other.counts)

@@ -1,4 +1,4 @@
-"""The policy: rules of the road from the traffic engine, a decision, a trajectory."""
+"""LimSim-TM as a policy: right of way of the traffic, a maneuver, a trajectory."""
 
 from __future__ import annotations
 
@@ -30,30 +30,34 @@ from limsim_jax.xla import interval
 
 
 class Memory(NamedTuple):
-    """What is kept between decisions, for `E` rows of egos."""
+    """Memory between decisions, for `E` rows of egos."""
 
-    slot: Int[Array, " E"]  # whose it is
-    side: Int[Array, " E"]  # lane change under way: 1 left, -1 right, 0 none
+    slot: Int[Array, " E"]  # of the vehicle that the row belongs to
+    side: Int[Array, " E"]  # lane change in progress: 1 left, -1 right, 0 none
     maneuvers: Maneuvers  # by the last search
     since: Float[Array, " E"]  # s, time of that search
-    plan: Trajectory | None  # of each of them, for the others to know
+    plan: Trajectory | None  # of each vehicle, shared with the others
 
 
 @dataclass(frozen=True)
 class LimSimTM(Policy):
-    """Searches for a manoeuvre, then plans a trajectory; the rules of the road are those of the traffic.
+    """Chooses a maneuver by search, then plans a trajectory.
+
+    Right of way is that of the traffic model. By default it knows the routes of all vehicles (`along_route`),
+    the driver parameters of the vehicles that it searches for, and the right of way that the traffic will
+    follow.
 
     Attributes:
       others: vehicles of the traffic that it drives beside the egos, see `AreaOfInterest`.
-      nearest: others that are looked at.
+      nearest: other vehicles that it considers.
       search: of maneuvers; None: lane changes by MOBIL.
       simulations: of each search, at least 1; None: as in `search`.
       search_every: decisions from one search to the next.
-      obedience: desired speed of the egos, as a share of the speed limit at most.
-      predict: where the others will be.
-      shares: whether vehicles that are planned for know each other's trajectories of the decision before.
+      obedience: upper bound of the egos' desired speed, as a share of the speed limit.
+      predict: predictor of the other vehicles.
+      shares: whether planned vehicles know each other's previous trajectories.
       lattice: of trajectories.
-      traffic: rules of the road, and how drivers follow each other.
+      traffic: right of way and car following.
     """
 
     others: int = 0
@@ -71,7 +75,7 @@ class LimSimTM(Policy):
 
     def __post_init__(self) -> None:
         if self.simulations is not None and self.simulations < 1:
-            raise ValueError(f"simulations: {self.simulations}; at least 1")
+            raise ValueError(f"simulations: {self.simulations}; expected at least 1")
 
     @property
     def settings(self) -> Settings | None:
@@ -81,7 +85,10 @@ class LimSimTM(Policy):
         return replace(self.search, simulations=self.simulations)
 
     def variants(self, seen: Predictor) -> dict[str, PolicyLike]:
-        """With a reference in the place of a module: what came to pass, MOBIL, car following on its lane."""
+        """The policy with a reference in the place of one module.
+
+        Prediction: the recorded future. Decision: MOBIL. Planning: car following on the lane.
+        """
         return {
             "prediction": replace(self, predict=seen),
             "decision": replace(self, search=None),
@@ -89,7 +96,7 @@ class LimSimTM(Policy):
         }
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Memory:
-        """No lane change under way, nothing searched."""
+        """No lane change, no search yet."""
         del lane_map
         rows = state.egos.slot.shape[0]
         size = self.settings or Settings()
@@ -143,10 +150,10 @@ class LimSimTM(Policy):
             since = jnp.where(due, now, since)
             wish = jnp.where(now - since < 1e2, maneuvers.side, wish)
 
-        # go on with a lane change until the middle of the body is on the other lane, as long as it is safe
+        # a lane change goes on while it is safe, until the centre of the body is on the other lane
         side = jnp.where(side.astype(d.dtype) * d < -0.3, 0, side)
         need = lane_map.routes.lanes_to_go[lane, goal]
-        # a lane on that side may lead nowhere: the change may be possible only further on
+        # the lane on that side may lead nowhere: the change may be possible only farther ahead
         aside, _ = neighbor(lane_map, lane, jnp.sign(need))
         need = jnp.where(self._leads_on(lane_map, state, slot, lane, aside, s), need, 0)
         room = lane_map.routes.change_distance[lane, goal] - s
@@ -157,12 +164,12 @@ class LimSimTM(Policy):
         target = path_from(lane_map, other_lane, other_s, goal, points=_POINTS, step=_STEP)
         traffic = around(state, prediction, target, slot, self.nearest)
         begins = (side == 0) & (jnp.abs(d) < 0.6) & self._may_change(lane_map, state, slot, lane, look)
-        # changes to the left and to the right begin in turns, as in all traffic
+        # changes to the left and to the right begin in turns, as in the traffic model
         begins &= look == jnp.where((state.step // config.decision_every) % 2 == 0, 1, -1)
         most = jnp.where(need * look > 0, 2.5 + 2.5 * press, 2.0)
         fits = self._fits(state, slot, traffic, most, 0.3 - 0.2 * press)
         begins &= ((wish == look) | (need * look > 0)) & fits | ((rule == look) & (need * rule > 0))
-        # what can wait does not begin shortly before a junction: it would stand between two lanes there
+        # optional changes do not begin shortly before a junction, where the vehicle would stop between lanes
         v = jnp.maximum(state.v[slot], CREEP_SPEED)
         inside = lane_map.is_connector[own.lane]  # along the path: roads may be in pieces before it
         junction = jnp.where(inside.any(-1), _STEP * jnp.argmax(inside, -1).astype(s.dtype), jnp.inf)
@@ -178,7 +185,7 @@ class LimSimTM(Policy):
         path, found = jax.tree.map(choose, (target, traffic), (own, nearby))
         d = jnp.where(changes, other_d, d)
         merge = Merge(
-            traffic.s, traffic.v, state.shape.length[traffic.slot], traffic.there & traffic.on_way,
+            traffic.s, traffic.v, state.shape.length[traffic.slot], traffic.there & traffic.on_path,
             jnp.where(there & (look * need > 0) & ~changes, jnp.clip(press, 0.2, 1.0), 0.0),
         )  # fmt: skip
         wanted = self._speed(maneuvers, now - since)
@@ -196,9 +203,9 @@ class LimSimTM(Policy):
         own: ReferencePath, nearby: Around, wall: Array, predict: Callable[[Array], Prediction],
         maneuvers: Maneuvers, due: Array, key: jax.Array,
     ) -> Maneuvers:  # fmt: skip
-        """What the search tells all planned vehicles, if it is `due`; otherwise the maneuvers of before.
+        """Maneuvers of the search if it is `due`; otherwise the previous ones.
 
-        A loop of at most one pass: where no world of a batch is due, it costs nothing.
+        A loop of at most one pass: if no world of a batch is due, it costs nothing.
         """
         settings, slot = self.settings, state.egos.slot
         if settings is None:
@@ -225,7 +232,7 @@ class LimSimTM(Policy):
     def _may_change(
         self, lane_map: LaneMap, state: State, slot: Array, lane: Array, side: Int[Array, " V"]
     ) -> Bool[Array, " V"]:
-        """Whether marks and vehicle class allow the change, outside junctions."""
+        """Whether lane marks and vehicle class allow the lane change, outside junctions."""
         other, allowed = neighbor(lane_map, lane, side)
         usable = ((lane_map.access[other] >> state.shape.vehicle_class[slot]) & 1) == 1
         allowed &= usable & ~lane_map.is_connector[lane] & (state.lane[slot] == lane)
@@ -234,7 +241,10 @@ class LimSimTM(Policy):
     def _leads_on(
         self, lane_map: LaneMap, state: State, slot: Array, lane: Array, other: Array, s: Array
     ) -> Bool[Array, " V"]:
-        """Whether the goal can be reached from the lane beside, by no longer way and without a hurry."""
+        """Whether the goal can be reached from the lane beside.
+
+        Without a detour, and with time for all lane changes that follow.
+        """
         routes, goal = lane_map.routes, state.goal[slot]
         there = (other != NO_LANE) & routes.reachable[other, goal]
         there &= routes.distance[other, goal] <= routes.distance[lane, goal] + 1.0
@@ -245,7 +255,7 @@ class LimSimTM(Policy):
         return there & ((count == 0) | fewer | back)
 
     def _speed(self, maneuvers: Maneuvers, late: Float[Array, " V"]) -> Float[Array, "V H"]:
-        """Speeds that the search had in mind, at the moments of the plan, m/s."""
+        """Speeds of the search at the moments of the plan, m/s."""
         if self.search is None:
             return jnp.full((late.shape[0], self.lattice.moments), _ANY_SPEED)
         at = (late[:, None] + self.lattice.times()[None]) / self.search.dt
@@ -262,14 +272,14 @@ class LimSimTM(Policy):
         most: Float[Array, " V"] | float,
         headway: Float[Array, " V"] | float = 0.3,
     ) -> Bool[Array, " V"]:
-        """Whether there is room on the path: nobody beside, nobody has to brake harder than `most` m/s^2."""
+        """Whether the path has a gap: no vehicle has to brake harder than `most` m/s^2."""
         most, headway = (
             jnp.broadcast_to(jnp.asarray(x, found.v.dtype), slot.shape)[:, None] for x in (most, headway)
         )
         v = state.v[slot][:, None]
         ahead, other = found.s > 0, jnp.maximum(found.v, 0)
         need = room_needed(jnp.where(ahead, v, other), jnp.where(ahead, other, v), most, headway)
-        return ~(found.on_way & (found.gap < need)).any(-1)
+        return ~(found.on_path & (found.gap < need)).any(-1)
 
     def _task(
         self,
@@ -293,7 +303,7 @@ class LimSimTM(Policy):
             ),
         )
         index, gap = decision.obstacles.other[slot, :-1], decision.obstacles.gap[slot, :-1]
-        ahead = found.there & found.on_way & (found.s > 0)
+        ahead = found.there & found.on_path & (found.s > 0)
         nearest = jnp.argmin(jnp.where(ahead, found.gap, NO_GAP), -1)[:, None]
         first = jnp.take_along_axis(jnp.where(ahead, found.gap, NO_GAP), nearest, 1)
         lead_gap = jnp.concatenate([jnp.where(index >= 0, gap, NO_GAP), first], -1)
@@ -301,7 +311,7 @@ class LimSimTM(Policy):
             [state.v[index], jnp.take_along_axis(jnp.maximum(found.v, 0), nearest, 1)], -1
         )
         leader = jnp.concatenate([index, jnp.take_along_axis(found.slot, nearest, 1)], -1)
-        follows = found.on_way & (found.s <= 0)
+        follows = found.on_path & (found.s <= 0)
         return Task(
             path=path,
             start=motion_on(path, state, slot, d),
@@ -323,8 +333,8 @@ class LimSimTM(Policy):
         )  # fmt: skip
 
 
-_POINTS, _STEP = 80, 2.0  # of a way, m
+_POINTS, _STEP = 80, 2.0  # points of a path, and m between them
 _BEFORE_JUNCTION = 30.0  # m
-_ANY_SPEED = 1e3  # m/s, where nobody has searched yet
-_FAR = 1e9  # m, where there is no plan yet
-_HARD = 4.0  # m/s^2, the hardest braking that a lane change may ask of anybody; then it is given up
+_ANY_SPEED = 1e3  # m/s, before the first search
+_FAR = 1e9  # m, before the first plan
+_HARD = 4.0  # m/s^2: a lane change that asks harder braking of any vehicle is given up

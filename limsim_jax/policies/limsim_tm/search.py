@@ -1,18 +1,18 @@
-"""Decisions of a small group of vehicles, together: decoupled UCT over meta-actions, `G` vehicles at once.
+"""Joint decisions of a group of vehicles: decoupled UCT over meta-actions.
 
-Every vehicle keeps its own statistics of its own five meta-actions in every node and chooses by UCB1 on
-its own utility; the joint action leads on to the next node (decoupled UCT: Finnsson and Bjornsson, AAAI
-2008; Tak, Lanctot, Winands, CIG 2014). Utilities mix the own reward with that of the rest of the group by
-the social value orientation, u_i = cos(svo_i) r_i + sin(svo_i) mean r_j (Schwarting et al., PNAS 2019).
+In every node each of the `G` vehicles keeps statistics of its own five meta-actions, and chooses by UCB1 on
+its own utility. The joint action leads to the next node (decoupled UCT: Finnsson and Bjornsson, AAAI 2008;
+Tak, Lanctot, Winands, CIG 2014). A utility mixes the vehicle's own reward with that of the rest of the group
+by its social value orientation, u_i = cos(svo_i) r_i + sin(svo_i) mean r_j (Schwarting et al., PNAS 2019).
 
-A simulation always drives from the root to the horizon: along the tree by chosen actions, from there on
-by the default policy. So a node holds statistics and no state, and a batch wastes nothing: whoever leaves
-the tree early spends the same steps on his rollout. Rows are read by one gather, and written by arithmetic
-over the whole table, which is small: scatters are loops on a CPU. `computed_once` stands where values of
-all pairs are used more than once: it halves the time.
+A simulation always runs from the root to the horizon: by chosen actions in the tree, then by the default
+policy. A node therefore holds statistics and no state, and all simulations of a batch take the same number of
+steps. Rows are read by one gather and written by arithmetic over the whole table, which is small: on a CPU
+scatters are loops. `computed_once` stands where values of all pairs are used several times, which halves the
+time.
 
-Arrays are those of one group, `[G]`, `[G, K]`, ..., and may have one more axis behind, which is a batch:
-`vmap` of `search` puts its axis there, for loops over the last axis are those that become vector code.
+Arrays are those of one group, `[G]`, `[G, K]`, ..., and may have a batch as their last axis: `vmap` of
+`search` puts its axis there, because loops over the last axis become vector code.
 """
 
 from __future__ import annotations
@@ -36,12 +36,11 @@ ACTIONS = 5
 
 
 class Scene(NamedTuple):
-    """`G` vehicles that are decided together and `K` others, on a corridor of `L` parallel lanes.
+    """`G` vehicles and `K` others on a corridor of `L` lanes.
 
-    Lanes count from 0 at the right; `s` runs along the corridor and `y` to the left from the centre of
-    lane 0. Lights and who goes first where ways cross are in `stop`. The others are given at the
-    `H = decisions * substeps + 1` moments of the search, from now on; put one that is not on the corridor
-    (yet) at a `y` far away.
+    Lanes count from 0 at the right; `s` runs along the corridor, and `y` to the left from the centre of lane
+    0. Lights and right of way enter as `stop`. The others are given at the `H = decisions * substeps + 1`
+    moments of the search, from now on. A vehicle that is not on the corridor has a `y` far away.
     """
 
     active: Bool[Array, " G"]
@@ -50,14 +49,14 @@ class Scene(NamedTuple):
     a: Float[Array, " G"]  # m/s^2, now
     lane: Int[Array, " G"]
     d: Float[Array, " G"]  # m, offset from the centre of that lane
-    aim: Int[Array, " G"]  # lane that it is moving to, or `lane`
+    aim: Int[Array, " G"]  # target lane of a lane change, or `lane`
     length: Float[Array, " G"]  # m
     width: Float[Array, " G"]  # m
     v0: Float[Array, " G"]  # m/s, desired speed
     driver: Driver  # [G]
-    first_lane: Int[Array, " G"]  # lanes that it may use: first_lane .. last_lane
+    first_lane: Int[Array, " G"]  # usable lanes: first_lane .. last_lane
     last_lane: Int[Array, " G"]
-    wanted_first: Int[Array, " G"]  # lanes that lead on along its route
+    wanted_first: Int[Array, " G"]  # lanes that lead along its route
     wanted_last: Int[Array, " G"]
     to_go: Float[Array, " G"]  # m until it must be in one of them
     stop: Float[Array, "G L"]  # m, position `s` before which it must stop if in that lane, NO_GAP if nowhere
@@ -72,7 +71,10 @@ class Scene(NamedTuple):
 
 @dataclass(frozen=True)
 class Settings:
-    """Size of the search, and what a reward is made of. Static: other values are another program."""
+    """Size of the search and weights of the reward.
+
+    Static: other values are another program.
+    """
 
     simulations: int = 50
     decisions: int = 5
@@ -80,13 +82,13 @@ class Settings:
     dt: float = 0.5  # s, sub-step
     exploration: float = 0.7  # of UCB1, on utilities that are scaled to 0..1
     lateral_speed: float = 1.17  # m/s of a lane change
-    # rewards, as shares of a reward that is 1 for driving at the desired speed in comfort
+    # weights of the reward, which is 1 for comfortable driving at the desired speed
     progress: float = 0.7
-    lane: float = 0.3  # per lane away from those that lead on
+    lane: float = 0.3  # per lane away from the wanted lanes
     comfort: float = 0.3  # at 4 m/s^2, grows as the square
     jerk: float = 0.05  # at a change of 4 m/s^2 within a sub-step, grows as the square
-    change: float = 0.04  # once for each lane change
-    push: float = 0.3  # while others must brake with 4 m/s^2 for a vehicle that moved before them
+    change: float = 0.04  # per lane change
+    push: float = 0.3  # while others must brake with 4 m/s^2 for a vehicle that cut in
     crash: float = 1.5  # once
 
     @property
@@ -115,7 +117,7 @@ def no_plan(vehicles: int, decisions: int) -> Int[Array, "G D"]:
 
 
 def shifted(action: Int[Array, "G D"], decisions: int = 1) -> Int[Array, "G D"]:
-    """`previous` for a search so many decisions after that which gave `action`."""
+    """`previous` for a search that follows after `decisions` decisions."""
     rest = jnp.full_like(action[:, :decisions], Meta.ACCELERATE)
     return jnp.concatenate([action[:, decisions:], rest], 1)
 
@@ -126,8 +128,8 @@ def search(settings: Settings, scene: Scene, previous: Int[Array, "G D"], key: K
     Args:
       settings: static.
       scene: the group and its surroundings; `vmap` over groups.
-      previous: actions to try first, of the search before (`shifted`) or `no_plan`.
-      key: orders actions that have not been tried yet. Same key, same plan.
+      previous: actions to try first, of the search before (`shifted`), or `no_plan`.
+      key: orders the untried actions. The same key gives the same plan.
     """
     noise = jax.random.uniform(key, (scene.s.shape[0], ACTIONS), scene.s.dtype)
     return batch_last(lambda *of: _search(settings, *of))(_in_floats(scene), previous, noise)
@@ -139,7 +141,7 @@ def play(settings: Settings, scene: Scene, actions: Int[Array, "G D"]) -> Plan:
 
 
 def _in_floats(scene: Scene) -> Scene:
-    """Lanes are places to the left: floats from here on."""
+    """The scene with lanes as floats: positions from here on."""
     names = "lane", "aim", "first_lane", "last_lane", "wanted_first", "wanted_last"
     lanes = {name: getattr(scene, name).astype(scene.s.dtype) for name in names}
     return scene._replace(**lanes, lane_width=scene.lane_width[None])
@@ -159,19 +161,19 @@ class _Motion(NamedTuple):
 
 
 class _Score(NamedTuple):
-    """What it has earned so far; `[G]`."""
+    """Reward so far; `[G]`."""
 
     reward: Array
     alive: Array  # has not collided
 
 
 class _Pairs(NamedTuple):
-    """What does not change within a search, of each vehicle and each of `M`: the group, or the others."""
+    """Constants of each vehicle and each of `M` vehicles: the group, or the others."""
 
     present: Array  # [G, M] or [1, M]
     length: Array  # [M]
     wide: Array  # [G, M] m, both half widths
-    behind: float  # share of the loss when m runs into the rear of i
+    behind: float  # share of the loss if m hits the rear of i
 
 
 class _Bodies(NamedTuple):
@@ -184,8 +186,8 @@ class _Bodies(NamedTuple):
 
 _FAR = 4 * NO_GAP
 _MARGIN_S, _MARGIN_Y = 0.5, 0.15  # m, added to lengths and widths in collision checks
-_LEAST_GAP = 0.5  # m, formulas of car following are evaluated here below it
-_MOVED = 0.5  # m to the side: it has left the place behind its old leader
+_LEAST_GAP = 0.5  # m; car following is evaluated at this gap below it
+_MOVED = 0.5  # m to the side, beyond which a vehicle has moved over
 _DECELERATE = 2.0  # m/s^2
 
 
@@ -214,7 +216,10 @@ def _most(x: Array) -> Array:
 
 
 def _fold(operator: Callable[[Array, Array], Array], x: Array) -> Array:
-    """Over axis 1, as arithmetic on the axes behind: a reduction would not become vector code."""
+    """Fold over axis 1 as arithmetic on the axes behind.
+
+    A reduction would not become vector code.
+    """
     result = x[:, 0]
     for k in range(1, x.shape[1]):
         result = operator(result, x[:, k])
@@ -222,7 +227,7 @@ def _fold(operator: Callable[[Array, Array], Array], x: Array) -> Array:
 
 
 def _stop_of(scene: Scene, lane: Array) -> Array:
-    """Where to stop in a lane (a float); `[G]`, m."""
+    """Position of the stop in a lane (a float); `[G]`, m."""
     result = jnp.full_like(scene.s, NO_GAP)
     for k in range(scene.stop.shape[1]):
         result = jnp.where(jnp.abs(lane - k) < 0.5, scene.stop[:, k], result)
@@ -230,10 +235,10 @@ def _stop_of(scene: Scene, lane: Array) -> Array:
 
 
 class _Ahead(NamedTuple):
-    """The most that anything ahead asks for; `[G]`."""
+    """The strongest demand of any leader; `[G]`."""
 
     z: Array  # desired gap over gap
-    needed: Array  # m/s^2, braking
+    needed: Array  # m/s^2, required braking
 
 
 def _look_ahead(pairs: _Pairs, scene: Scene, motion: _Motion, bodies: _Bodies) -> _Ahead:
@@ -262,10 +267,12 @@ def _accelerate(
     motion: _Motion,
     others: _Bodies,
 ) -> Array:
-    """IDM behind all who are on the way to the lane aimed at, and behind where to stop; m/s^2.
+    """Acceleration by the IDM, m/s^2.
 
-    Where the IDM brakes harder than `b` plus what not to hit the leader takes if that keeps its speed,
-    this is enough, as it is for the ACC-IDM: short gaps after a cut-in are no emergency.
+    Behind all leaders up to the target lane, and before stops.
+
+    Braking is limited to `b` plus the braking that avoids a leader which keeps its speed, as in the ACC-IDM:
+    short gaps after a cut-in are no emergency.
     """
     driver, v = scene.driver, motion.v
     own = _Bodies(motion.s, motion.y, v)
@@ -285,10 +292,10 @@ def _accelerate(
 
 
 class _Contact(NamedTuple):
-    """What a vehicle did to its neighbours; `[G]`."""
+    """Effects of a vehicle on its neighbors; `[G]`."""
 
     loss: Array  # share of a collision
-    pushed: Array  # how hard others must brake for it
+    pushed: Array  # braking that it imposes on others, scaled
 
 
 def _look_around(pairs: _Pairs, scene: Scene, motion: _Motion, bodies: _Bodies, dt: float) -> _Contact:
@@ -298,7 +305,7 @@ def _look_around(pairs: _Pairs, scene: Scene, motion: _Motion, bodies: _Bodies, 
     beside &= pairs.present
     overlap = (ahead - pairs.length[None] < _MARGIN_S) & (ahead + length > -_MARGIN_S)
 
-    # who has changed lanes, or was behind, loses most
+    # a vehicle that has changed lanes, or was behind, bears the whole loss
     start = scene.lane * scene.lane_width + scene.d
     moved = (jnp.abs(motion.y - start) > _MOVED)[:, None]
     before = ahead + (motion.v[:, None] - bodies.v[None]) * dt
@@ -325,7 +332,7 @@ def _drive(
     now: _Bodies,
     then: _Bodies,
 ) -> tuple[_Motion, _Score]:
-    """One sub-step: the group moves, others go from `now` to `then`; what it earns."""
+    """One sub-step: the group moves, the others go from `now` to `then`."""
     dt, width = settings.dt, scene.lane_width
     a = _accelerate(pairs, scene, motion, now)
     a = jnp.where(scene.active, jnp.minimum(a, cap), 0)
@@ -357,7 +364,10 @@ def _drive(
 
 
 def _allowed(scene: Scene, motion: _Motion) -> tuple[Array, Array]:
-    """Whether it may aim farther left, and right; a change on its way is only turned back."""
+    """Whether lane changes to the left and right may begin.
+
+    During a lane change only its reversal is allowed.
+    """
     offset = motion.aim * scene.lane_width - motion.y
     left = (motion.aim + 1 <= scene.last_lane) & (offset < 0.5 * scene.lane_width)
     right = (motion.aim - 1 >= scene.first_lane) & (offset > -0.5 * scene.lane_width)
@@ -367,7 +377,7 @@ def _allowed(scene: Scene, motion: _Motion) -> tuple[Array, Array]:
 def _decide(
     settings: Settings, scene: Scene, motion: _Motion, score: _Score, action: Array
 ) -> tuple[_Motion, _Score, Array]:
-    """A decision begins: the new aim, what it costs, and most acceleration."""
+    """Start of a decision: the new target lane, its cost, and the highest acceleration."""
     left, right = _allowed(scene, motion)
     step = jnp.where((action == Meta.LEFT) & left, 1.0, jnp.where((action == Meta.RIGHT) & right, -1.0, 0.0))
     reward = score.reward - score.alive * settings.change * jnp.abs(step)
@@ -382,7 +392,7 @@ def _start(scene: Scene) -> tuple[_Motion, _Score]:
 
 
 def _moments(settings: Settings, scene: Scene) -> _Bodies:
-    """Predictions by decision and the moments within it, `[D, substeps + 1, K]`."""
+    """Predictions by decision and moment, `[D, substeps + 1, K]`."""
 
     def windows(x: Array) -> Array:
         x = jnp.moveaxis(x, 1, 0)
@@ -412,7 +422,7 @@ def _decision(
 
 
 def _utility(scene: Scene, reward: Array) -> Array:
-    """Own reward and that of the rest of the group, mixed by the social value orientation; `[G]`."""
+    """Own reward mixed with the group's by the social value orientation; `[G]`."""
     mine = jnp.where(scene.active, reward, 0)
     rest = jnp.where(scene.active, 1.0, 0.0).sum(0)[None] - 1
     mean = (mine.sum(0)[None] - mine) / jnp.maximum(rest, 1)
@@ -468,7 +478,7 @@ class _Tree(NamedTuple):
 
 
 def _row(table: Array, row: Array) -> Array:
-    """`table[row]` for a table with a batch behind and a row for each of it."""
+    """`table[row]` for a table whose last axis is a batch."""
     rest = table.shape[1:]
     size = table[0].size
     row = row.reshape((1,) * (len(rest) - row.ndim) + row.shape)
@@ -513,7 +523,7 @@ def _ucb(settings: Settings, tree: _Tree, node: Array, allowed: Array, order: Ar
 
 
 def _options(scene: Scene, motion: _Motion) -> Array:
-    """Actions that make sense, `[G, ACTIONS]`; of an empty slot only KEEP."""
+    """Possible actions, `[G, ACTIONS]`; KEEP alone for an empty slot."""
     left, right = _allowed(scene, motion)
     always = jnp.ones_like(scene.active)
     return jnp.stack([always, scene.active, scene.active, left & scene.active, right & scene.active], 1)
@@ -526,7 +536,7 @@ def _search(settings: Settings, scene: Scene, previous: Array, noise: Array) -> 
     plan = jnp.moveaxis(previous, 1, 0)
     depths = jnp.arange(depth)
     joint: int = ACTIONS**count
-    # fractions of multiples of an irrational number are spread evenly: an order for each simulation
+    # multiples of an irrational number modulo 1 are spread evenly: an order for each simulation
     stride = 0.38196601 + 0.1 * noise
 
     def simulate(n: Array, tree: _Tree) -> _Tree:
@@ -582,7 +592,7 @@ def _search(settings: Settings, scene: Scene, previous: Array, noise: Array) -> 
     )
     tree: _Tree = lax.fori_loop(0, settings.simulations, simulate, empty)
 
-    # what each would rather do, as far as it has been seen to go well together
+    # the preferred first actions of each vehicle, among the joint plans that were simulated
     favour = tree.worth
     for k in range(ACTIONS):
         share = tree.visits[0, :, k] / settings.simulations
@@ -592,13 +602,14 @@ def _search(settings: Settings, scene: Scene, previous: Array, noise: Array) -> 
     return _play(settings, scene, actions)._replace(visits=tree.visits[0])
 
 
-_SEEN = 1.0  # weight of the utilities of a plan, next to the share of visits of its first actions
+_SEEN = 1.0  # weight of a plan's utilities against the share of visits of its first actions
 
 
 def _worth(scene: Scene, score: _Score, utility: Array) -> Array:
-    """What a simulation is worth next to the share of visits of its first actions.
+    """Value of a simulation next to the visits of its first actions.
 
-    Plans without collisions go first. Who is alone knows what he gets, and takes the best that he saw.
+    Plans without collisions come first. A vehicle alone in its group takes the best plan that was simulated:
+    no other vehicle's choice can change its value.
     """
     crashed = jnp.where((score.alive == 0) & scene.active, 1.0, 0.0).sum(0)
     alone = scene.active.sum(0) == 1

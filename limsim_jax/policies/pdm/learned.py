@@ -1,9 +1,9 @@
-"""PDM-Hybrid: the trajectory of PDM-Closed, and beyond two seconds a learned correction of it.
+"""PDM-Hybrid: the trajectory of PDM-Closed with a learned correction beyond two seconds.
 
-Dauner, Hallgarten, Geiger, Chitta, CoRL 2023: rules drive best, and a network foresees best where the
-vehicle will be in eight seconds. The network (PDM-Offset) sees the last two seconds of the vehicle, the
-middle of the lane for 120 m and the poses of PDM-Closed, each through a layer of its own, then two common
-layers; it adds an offset to every pose. `limsim_jax.training` trains it on rollouts.
+Dauner, Hallgarten, Geiger, Chitta, CoRL 2023: rules drive best, a network forecasts best over eight seconds.
+The network (PDM-Offset) sees the last two seconds of the vehicle, the middle of the lane for 120 m, and the
+poses of PDM-Closed. Each input has a layer of its own, two layers are common. It adds an offset to every
+pose. `limsim_jax.training` trains it on rollouts.
 """
 
 from __future__ import annotations
@@ -50,12 +50,15 @@ WEIGHTS = Path(__file__).with_name("pdm_hybrid.npz")
 BEYOND = round(POSES * POSE_TIME / DT) - STEPS
 """Steps of PDM-Closed beyond its own 4 s."""
 
-_SCALE = np.array([30.0, 5.0, 0.5])  # m, m, rad: about the size of inputs and offsets
+_SCALE = np.array([30.0, 5.0, 0.5])  # m, m, rad: typical size of inputs and offsets
 _OFFSET_SCALE = np.array([5.0, 1.0, 0.1])
 
 
 class Features(NamedTuple):
-    """What the network sees of `E` egos, in the frame of the ego: x ahead of its centre, y to the left."""
+    """Inputs of the network for `E` egos.
+
+    In the frame of the ego: x ahead of its centre, y to the left.
+    """
 
     history: Float[Array, "E 11 8"]  # x, y (m), heading (rad), velocity (m/s, rad/s), acceleration (m/s^2)
     centre_line: Float[Array, "E 120 3"]  # x, y (m), heading (rad)
@@ -96,7 +99,7 @@ def _flat(values: Array) -> Array:
 
 
 class Past(NamedTuple):
-    """The last two seconds of `E` egos at their decisions, the latest first."""
+    """The last two seconds of `E` egos at decisions, latest first."""
 
     x: Float[Array, "E L"]  # m
     y: Float[Array, "E L"]
@@ -107,7 +110,7 @@ class Past(NamedTuple):
 
 
 def no_past(config: Config, state: State) -> Past:
-    """A past up to one decision ago, as if they had come straight on at their speed."""
+    """A past at constant velocity, up to one decision ago."""
     count = math.ceil((HISTORY - 1) * HISTORY_TIME / config.decision_time - 1e-6) + 1
     egos = state.egos
     back = config.decision_time * jnp.arange(1, count + 1, dtype=egos.x.dtype)[None]
@@ -125,7 +128,7 @@ def no_past(config: Config, state: State) -> Past:
 
 
 def remember(past: Past, state: State) -> Past:
-    """The past with the present moment in front."""
+    """The past with the present moment added in front."""
     egos, slot = state.egos, state.egos.slot
     turn = state.v[slot] * jnp.tan(egos.steering) / jnp.maximum(state.shape.wheelbase[slot], 1.0)
     now = egos.x, egos.y, egos.heading, state.v[slot], state.a[slot], turn
@@ -135,7 +138,7 @@ def remember(past: Past, state: State) -> Past:
 
 
 def poses_of(plan: Plan) -> tuple[Array, Array, Array]:
-    """x, y, heading of a plan with its tail, every `DT` s from now on, `[E, 81]`."""
+    """x, y and heading of a plan and its tail; `[E, 81]`."""
     both = plan.trajectory, plan.tail
     x, y, heading = (
         jnp.concatenate([getattr(part, name) for part in both], 1) for name in ("x", "y", "heading")
@@ -149,7 +152,7 @@ def features(
     """The inputs of the network. `past` includes the present; `plan` reaches 8 s."""
     egos = state.egos
     origin = egos.x[:, None], egos.y[:, None], egos.heading[:, None]
-    # moments of the past, between those that are remembered
+    # moments of the past, interpolated between decisions
     at = HISTORY_TIME / config.decision_time * np.arange(HISTORY)
     first = np.minimum(at.astype(int), past.x.shape[1] - 2)
     share = jnp.asarray(at - first, past.x.dtype)[None]
@@ -191,12 +194,12 @@ def in_frame(origin: tuple[Any, Any, Any], x: Any, y: Any, heading: Any) -> Any:
 class PDMHybrid(Policy):
     """PDM-Closed with learned poses beyond `CORRECTED_FROM`; its egos move in the plane.
 
-    Its trajectory reaches 8 s. What is driven until the next decision is PDM-Closed's.
+    Its trajectory covers 8 s. Until the next decision the vehicle drives as PDM-Closed.
 
     Attributes:
       weights: file of `save_weights`; None: those that come with the package.
-      seen: as `PDMClosed` has it.
-      strict_tuplan: as `PDMClosed` has it.
+      seen: as in `PDMClosed`.
+      strict_tuplan: as in `PDMClosed`.
     """
 
     weights: str | None = None
@@ -218,14 +221,14 @@ class PDMHybrid(Policy):
         return str(WEIGHTS) if self.weights is None else self.weights
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Past:
-        """A past that went straight on."""
+        """A past at constant velocity."""
         del lane_map
         return no_past(config, state)
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Past, key: jax.Array
     ) -> tuple[Command, Past]:
-        """PDM-Closed's trajectory for 2 s, and the corrected one up to 8 s."""
+        """PDM-Closed's trajectory for 2 s, then the corrected one."""
         del key
         past = remember(memory, state)
         return self.foresee(config, lane_map, state, past)[0], past
@@ -233,7 +236,7 @@ class PDMHybrid(Policy):
     def foresee(
         self, config: Config, lane_map: LaneMap, state: State, past: Past
     ) -> tuple[Command, Float[Array, "E 16 3"]]:
-        """What to do, and the poses of the network in the frame of each ego."""
+        """The command, and the network's poses in the frame of each ego."""
         plan = self.closed.plan(config, lane_map, state, beyond=BEYOND)
         seen = features(config, lane_map, state, past, plan, self.strict_tuplan)
         weights = load_weights(self.path)
@@ -241,7 +244,7 @@ class PDMHybrid(Policy):
         poses = Offset(hidden).apply({"params": weights}, seen)
         assert isinstance(poses, jax.Array)
 
-        # the correction at the poses, 0 until CORRECTED_FROM, drawn straight between them
+        # the correction at the poses, 0 until CORRECTED_FROM, linear in between
         change = poses - seen.plan
         kept = POSE_TIME * np.arange(1, POSES + 1) > CORRECTED_FROM
         change = jnp.where(jnp.asarray(kept)[None, :, None], change, 0)
@@ -260,7 +263,7 @@ class PDMHybrid(Policy):
         y = jnp.where(braking, y, y + sin * change[..., 0] + cos * change[..., 1])
         heading = jnp.where(braking, heading, heading + change[..., 2])
         v = jnp.concatenate([plan.trajectory.v, plan.tail.v], 1)
-        # speed along the heading of what was corrected
+        # speed of the corrected poses along their heading
         moved = (jnp.diff(x) * jnp.cos(heading[:, :-1]) + jnp.diff(y) * jnp.sin(heading[:, :-1])) / DT
         moved = jnp.maximum(jnp.concatenate([moved, moved[:, -1:]], 1), 0)
         late = jnp.asarray(moment * DT > CORRECTED_FROM)[None] & ~braking
@@ -274,7 +277,7 @@ class PDMHybrid(Policy):
 
 
 def save_weights(path: str | Path, weights: Any) -> None:
-    """Write the parameters of `Offset` as .npz, in half precision; never half a file."""
+    """Write the parameters of `Offset` as .npz, in half precision and atomically."""
     flat = {
         f"{layer}/{name}": np.asarray(value, np.float16)
         for layer, values in weights.items()
@@ -290,7 +293,7 @@ def load_weights(path: str) -> dict[str, dict[str, np.ndarray]]:
     """Read what `save_weights` wrote.
 
     Raises:
-      ValueError: no such file, or not weights of this network.
+      ValueError: no such file, or weights of another network.
     """
     try:
         with np.load(path) as file:

@@ -25,18 +25,17 @@ from limsim_jax.types import Config, State
 from limsim_jax.xla import computed_once
 
 EMERGENCY_TIME, EMERGENCY_SPEED, EMERGENCY_BRAKING = 2.0, 5.0, 7.0
-"""s to a contact by the own fault that lead to emergency braking; m/s up to which they do in the public
-implementation; m/s^2 of braking in ours."""
+"""Emergency braking: s to an at-fault contact; m/s, greatest speed for it if `strict_tuplan`; m/s^2."""
 
-_AS_GOOD = 1e-3  # scores that differ by less are equal
+_AS_GOOD = 1e-3  # scores that differ by less count as equal
 
 
 class Plan(NamedTuple):
-    """What was decided, for `V` vehicles."""
+    """Decision for `V` vehicles."""
 
     trajectory: Trajectory  # [V T], centre of the body
-    best: Int[Array, " V"]  # proposal
-    signal: Int[Array, " V"]  # +1 or -1 if it leads into the lane to the left or right
+    best: Int[Array, " V"]  # index of the proposal
+    signal: Int[Array, " V"]  # +1 or -1 for a lane change to the left or right
     brakes: Bool[Array, " V"]  # emergency
     scores: Scores
     tail: Trajectory  # [V T'], the proposal beyond the trajectory
@@ -47,9 +46,9 @@ class PDMClosed(Policy):
     """PDM-Closed as a policy; its egos move in the plane.
 
     Attributes:
-      seen: the nearest others that count.
-      strict_tuplan: the conventions of the public implementation; the module's docstring has them.
-      predict: forecast of the others.
+      seen: number of nearest other vehicles that it considers.
+      strict_tuplan: conventions of the public implementation, see `limsim_jax.policies.pdm`.
+      predict: predictor of the others.
     """
 
     seen: int = 32
@@ -58,10 +57,13 @@ class PDMClosed(Policy):
 
     def __post_init__(self) -> None:
         if self.seen < 1:
-            raise ValueError(f"seen: {self.seen} others; at least 1")
+            raise ValueError(f"seen: {self.seen} others; expected at least 1")
 
     def variants(self, seen: Predictor) -> dict[str, PolicyLike]:
-        """With a reference in the place of a module: what came to pass, car following on its lane."""
+        """The policy with a reference in the place of one module.
+
+        Prediction: the recorded future. Planning: car following on the lane.
+        """
         return {"prediction": replace(self, predict=seen), "planning": FollowLane()}
 
     def __call__(
@@ -73,7 +75,7 @@ class PDMClosed(Policy):
         return Command(trajectory=plan.trajectory, signal=plan.signal), memory
 
     def plan(self, config: Config, lane_map: LaneMap, state: State, beyond: int = 0) -> Plan:
-        """The decision, and the chosen proposal for so many steps of `DT` beyond its trajectory."""
+        """The decision, with the chosen proposal for `beyond` more steps of `DT`."""
         strict, slot = self.strict_tuplan, state.egos.slot
         steps = STEPS + beyond
         body = computed_once(bodies(state, slot))
@@ -86,7 +88,7 @@ class PDMClosed(Policy):
         lead = computed_once(poses(road, body, proposals, strict))
         motion = computed_once(drive_along(fitted(lead) if strict else lead, body, STEPS, strict))
         scores = score(road, body, others, proposals, motion, strict)
-        # of proposals that are as good the first one: the middle of the lane, and the slower one
+        # the first of equally good proposals: the middle of the lane, and the slower driver
         slack = 0.0 if strict else _AS_GOOD
         best = jnp.argmax(scores.total >= jnp.max(scores.total, -1, keepdims=True) - slack, -1)
         pick = lambda values: jnp.take_along_axis(values, best[:, None, None], 1)[:, 0]  # noqa: E731
@@ -115,7 +117,7 @@ class PDMClosed(Policy):
 
 
 def _centred(body: Body, poses: tuple[Array, ...], t0: Array) -> Trajectory:
-    """Poses of the rear axle (x, y, heading, and speed) as a trajectory of the centre of the body."""
+    """Poses of the rear axle as a trajectory of the centre."""
     x, y, heading, v = poses
     axle = body.wheelbase[:, None] / 2
     return Trajectory(
@@ -124,7 +126,7 @@ def _centred(body: Body, poses: tuple[Array, ...], t0: Array) -> Trajectory:
 
 
 def _stop_along(body: Body, x: Array, y: Array, heading: Array) -> tuple[Array, ...]:
-    """The same path of the rear axle, braked with `EMERGENCY_BRAKING` to a standstill."""
+    """Poses on the same path, braked with `EMERGENCY_BRAKING` to a standstill."""
     t, v0 = DT * jnp.arange(STEPS + 1, dtype=x.dtype)[None], body.v[:, None]
     braking = jnp.minimum(t, v0 / EMERGENCY_BRAKING)
     distance = v0 * braking - EMERGENCY_BRAKING * braking * braking / 2
@@ -135,7 +137,7 @@ def _stop_along(body: Body, x: Array, y: Array, heading: Array) -> tuple[Array, 
 
 
 def _stop_straight(body: Body) -> tuple[Array, ...]:
-    """Poses of the rear axle straight on, at the speed that nuPlan's tracker is to be given."""
+    """Straight poses of the rear axle, at a speed for nuPlan's tracker."""
     t, v0 = DT * jnp.arange(STEPS + 1, dtype=body.v.dtype)[None], body.v[:, None]
     u = jnp.where(v0 > STOPPING_SPEED, -10 * v0, -4 * v0 - body.a[:, None])
     low, high = COMFORT["acceleration"]

@@ -14,7 +14,7 @@ from limsim_jax.policies.reference import to_cartesian
 from limsim_jax.xla import computed_once, mapped_like
 
 FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)
-"""Of the speed limit: what the five drivers wish for."""
+"""Desired speeds of the five drivers, as shares of the speed limit."""
 
 S0, HEADWAY, ACCELERATION, DECELERATION, HARDEST = 1.0, 1.5, 1.5, 3.0, 3.0
 """IDM: standstill gap (m), time gap (s), acceleration, comfortable deceleration, braking limit (m/s^2)."""
@@ -22,23 +22,23 @@ S0, HEADWAY, ACCELERATION, DECELERATION, HARDEST = 1.0, 1.5, 1.5, 3.0, 3.0
 LATE_STOP, HARDEST_BEHIND = 1.0, 6.0
 """Unless strict: m that the tracker needs beyond the standstill gap; braking limit behind others (m/s^2)."""
 
-_LEAST_GAP = 0.1  # m: who is nearer than the standstill gap brakes as hard as it can
-_MERGE_TIME, _MERGE_LEAST = 3.0, 12.0  # s and m in which a path comes to an offset 2 m away, or farther,
-_KEEP_SHARE = 0.66  # and the least share of that for one that is nearer
-_COARSE = 4  # points of the centerline per point where a projection starts
+_LEAST_GAP = 0.1  # m, least gap in the IDM: below the standstill gap it brakes hard
+_MERGE_TIME, _MERGE_LEAST = 3.0, 12.0  # s, and at least m, in which a path reaches an offset 2 m away
+_KEEP_SHARE = 0.66  # least share of that distance, for nearer offsets
+_COARSE = 4  # points of the centerline per start point of a projection
 
 
 class Leaders(NamedTuple):
-    """Others in coordinates of the centerline, at the looks of the IDM: `H`."""
+    """Others along the centerline, at `H` moments."""
 
-    rear: Float[Array, "H V 3 K"]  # m, of those on the corridor of a path, else far away
+    rear: Float[Array, "H V 3 K"]  # m, of vehicles on the corridor of a path; otherwise far away
     centre: Float[Array, "H V K"]  # m
     v: Float[Array, "H V K"]  # m/s along the centerline
 
 
 @jax.named_scope("pdm_leaders")
 def leaders(road: Road, body: Body, others: Others, steps: int) -> Leaders:
-    """Who is on the corridor of each path: the width of the body around it."""
+    """Vehicles on the corridor of each path, as wide as the body."""
     centerline = road.centerline
     others = others._replace(**{n: getattr(others, n)[:steps:LOOK_EVERY] for n in ("x", "y", "cos", "sin")})
     looks = others.x.shape[0]
@@ -75,7 +75,7 @@ def leaders(road: Road, body: Body, others: Others, steps: int) -> Leaders:
 
 
 class Proposals(NamedTuple):
-    """What the IDM drivers would do on each path: `P` = 15, path by path, `T` moments."""
+    """Motion of the IDM drivers on each path: `P` = 15, path by path, `T` moments."""
 
     s: Float[Array, "V P T"]  # m along the centerline, rear axle
     v: Float[Array, "V P T"]  # m/s
@@ -83,7 +83,10 @@ class Proposals(NamedTuple):
 
 @jax.named_scope("pdm_idm")
 def idm(road: Road, body: Body, along: Leaders, strict: bool) -> Proposals:
-    """Integrate the fifteen drivers; each looks for its leader every second step."""
+    """Integrate the fifteen drivers.
+
+    Each looks for its leader every second step.
+    """
     limit = road.centerline.limit
     shape = (*body.v.shape, len(OFFSETS), len(FRACTIONS))
     fraction = jnp.broadcast_to(jnp.asarray(FRACTIONS, body.v.dtype), shape)
@@ -106,13 +109,13 @@ def idm(road: Road, body: Body, along: Leaders, strict: bool) -> Proposals:
         a = jnp.clip(ACCELERATION * (1 - free - z * z), -HARDEST, ACCELERATION)
         if strict:
             return a
-        # red lights and limits are known from afar, what a leader does is not
+        # lights and limits are known in advance, the braking of a leader is not
         behind = jnp.maximum(ACCELERATION * (1 - z * z), -HARDEST_BEHIND)
         return jnp.where(at < wall, jnp.minimum(a, behind), a)
 
     def look(carry: tuple[Array, ...], seen: Leaders) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
         s, v, first = carry
-        # leaders: those ahead of the own centre, the nearest rear counts
+        # the leader has the nearest rear among vehicles ahead of the own centre
         ahead = seen.centre[:, None, None] > (s + centre)[..., None]
         rear = jnp.where(ahead, seen.rear[:, :, None], FAR)  # [V 3 5 K]
         nearest_rear = jnp.min(rear, -1)
@@ -150,7 +153,7 @@ def idm(road: Road, body: Body, along: Leaders, strict: bool) -> Proposals:
 
 
 class Poses(NamedTuple):
-    """Proposals in the plane, to be tracked: poses of the rear axle."""
+    """Proposals in the plane: poses of the rear axle, to be tracked."""
 
     x: Float[Array, "V P T"]  # m
     y: Float[Array, "V P T"]
@@ -161,14 +164,14 @@ class Poses(NamedTuple):
 
 @jax.named_scope("pdm_poses")
 def poses(road: Road, body: Body, proposals: Proposals, strict: bool) -> Poses:
-    """Lay the proposals on their paths."""
+    """Poses of the proposals on their paths."""
     offset = jnp.repeat(road.offset, len(FRACTIONS), 1)[..., None]  # [V P 1]
     s, v = proposals
     if strict:
         d = jnp.broadcast_to(offset, s.shape)
         slope = bend = jnp.zeros_like(s)
     else:
-        # a cubic from where the vehicle is and points to; a lane change takes longer than to keep the lane
+        # a cubic from the present position and heading; a lane change is longer than a correction
         shift = road.d[:, None, None] - offset
         share = jnp.clip(jnp.abs(shift) / 2, _KEEP_SHARE, 1)
         reach = share * jnp.maximum(_MERGE_TIME * body.v, _MERGE_LEAST)[:, None, None]

@@ -1,4 +1,4 @@
-"""The road ahead of the planned vehicles, the paths along it, and the other vehicles around."""
+"""The road ahead of the planned vehicles, its paths, and other vehicles."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ SPACING = 2.0
 """m between points of the reference path."""
 
 EDGE_MARGIN = 0.3
-"""m from a path to the edge of the road, for tracking errors."""
+"""m between the body on a path and the edge of the road, for tracking errors."""
 
 FAR = 1e6
 """m to an obstacle where there is none."""
 
 _POINTS = 121  # of the reference path: 240 m
-_KEEPS = 61  # points of the centerline on which all of the body keeps to the road: 120 m
-_LANES = 6  # of the centerline, beyond the first
-_CHANGE_WITHIN = 300.0  # m to the last place for a lane change, within which it is wished for
-_CHANGE_ROOM = 20.0  # m before that place, kept free to change lanes from a standstill
-_CHANGE_WORTH = 15.0  # m of progress that a required lane change counts for
-_YELLOW = 3.0  # m/s^2: who can stop with this stops at yellow
-_CANNOT = 6.0  # m/s^2: who would have to brake harder to stop at red drives on
+_KEEPS = 61  # points along which the whole body stays on the road: 120 m
+_LANES = 6  # lanes of the centerline beyond the first
+_CHANGE_WITHIN = 300.0  # m to the last place for a required lane change, within which it is wanted
+_CHANGE_ROOM = 20.0  # m before that place, for a lane change from a standstill
+_CHANGE_WORTH = 15.0  # m of progress that a required lane change is worth
+_YELLOW = 3.0  # m/s^2, braking below which a vehicle stops at yellow
+_CANNOT = 6.0  # m/s^2, braking above which a vehicle does not stop at red
 
 
 class Body(NamedTuple):
@@ -67,17 +67,17 @@ class Body(NamedTuple):
 
 
 class Road(NamedTuple):
-    """The way that the planned vehicles follow, from the rear axle on, and the paths along it."""
+    """The centerline ahead of the rear axle, and the paths along it."""
 
     centerline: ReferencePath
     s: Float[Array, " V"]  # m, of the rear axle
     d: Float[Array, " V"]  # m
-    slope: Float[Array, " V"]  # m/m, direction of motion against the centerline
-    offset: Float[Array, "V 3"]  # m, of the paths
-    wall: Float[Array, "V 3"]  # m along the centerline, standing obstacle on each of them
-    worth: Float[Array, "V 3"]  # m of progress that a path is worth besides
+    slope: Float[Array, " V"]  # m/m, of the heading against the centerline
+    offset: Float[Array, "V 3"]  # m, of the paths from the centerline
+    wall: Float[Array, "V 3"]  # m along the centerline to the stop obstacle of each path
+    worth: Float[Array, "V 3"]  # m of progress that a path is worth in addition
     half: Float[Array, "V M"]  # m, half the width of the lane
-    oncoming: Float[Array, "V M"]  # m, width of the lane for the opposite direction beyond the left edge
+    oncoming: Float[Array, "V M"]  # m, width of the oncoming lane beyond the left edge
     connector: Bool[Array, "V M"]  # inside a junction
 
 
@@ -113,7 +113,7 @@ def bodies(state: State, slot: Int[Array, " V"]) -> Body:
 
 @jax.named_scope("pdm_road")
 def road_ahead(lane_map: LaneMap, state: State, slot: Int[Array, " V"], body: Body, strict: bool) -> Road:
-    """ReferencePath, paths, and what stands on them: red lights, and the end of lanes that lead nowhere."""
+    """Centerline, paths, and stop obstacles: red lights and ends of lanes."""
     routes = lane_map.routes
     own, previous, goal, front = state.lane[slot], state.previous[slot], state.goal[slot], state.s[slot]
     to_go = routes.lanes_to_go[own, goal]
@@ -128,7 +128,7 @@ def road_ahead(lane_map: LaneMap, state: State, slot: Int[Array, " V"], body: Bo
     came_beside = jnp.where(side > 0, lane_map.left[previous], lane_map.right[previous])
     came = jnp.where(changes, came_beside, previous)
 
-    # the way starts at the rear axle, which may be on the lane before
+    # the centerline starts at the rear axle, which may be on the previous lane
     s = front - body.front
     behind = (s < 0) & (came != NO_LANE)
     first = jnp.where(behind, came, lane)
@@ -145,7 +145,7 @@ def road_ahead(lane_map: LaneMap, state: State, slot: Int[Array, " V"], body: Bo
     across = side.astype(d.dtype) * (width(lane_map, lane, front) + width(lane_map, own, state.s[slot])) / 2
     offset = jnp.broadcast_to(jnp.asarray(OFFSETS, d.dtype), (*d.shape, 3))
     if not strict:
-        # in a bend the corners swing out
+        # in bends the corners swing out
         taken = (
             EDGE_MARGIN
             + body.width[:, None] / 2
@@ -196,7 +196,10 @@ def _wall(
     after: Int[Array, " V"],
     strict: bool,
 ) -> Float[Array, " V"]:
-    """m along the centerline to the first light that says stop, or the end of a lane that leads nowhere."""
+    """m along the centerline to the first stop obstacle.
+
+    It is a light that says stop, or the end of a lane that leads nowhere.
+    """
     routes = lane_map.routes
     shows = lane_states(lane_map.signals, state.lights.phase)
     wall, start = jnp.full_like(s, FAR), -s
@@ -250,7 +253,7 @@ def others_around(
 
 
 def _thinned(prediction: Any) -> Any:
-    """Every tenth moment: enough to tell who comes near."""
+    """The prediction at every tenth moment, enough to find the nearest vehicles."""
     return prediction.replace(
         x=prediction.x[:, ::10],
         y=prediction.y[:, ::10],

@@ -1,4 +1,4 @@
-"""nuPlan's closed-loop metrics of all proposals, against a forecast of the other vehicles."""
+"""Scores of the proposals: nuPlan's closed-loop metrics against a forecast."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from limsim_jax.traffic.collision import OVERHANG
 from limsim_jax.xla import computed_once, mapped_like
 
 TTC = (0.0, 0.3, 0.6, 0.9)
-"""s that everybody is moved on to look for contacts."""
+"""s by which all vehicles are moved on to look for contacts."""
 
-_OVERSHOOT = 0.2  # m of that which a proposal leaves, as the next one may come out farther
-_STANDS = 0.05  # m/s: who is slower stands (nuPlan)
+_OVERSHOOT = 0.2  # m of the tolerance that a proposal keeps, because the next one may go farther
+_STANDS = 0.05  # m/s, standstill (nuPlan)
 
 
 class Scores(NamedTuple):
-    """Of all proposals; multipliers and metrics from 0 to 1."""
+    """Scores of all proposals; multipliers and metrics from 0 to 1."""
 
     total: Float[Array, "V P"]
-    no_fault: Float[Array, "V P"]  # no contact by the own fault
+    no_fault: Float[Array, "V P"]  # no at-fault contact
     drivable: Float[Array, "V P"]
     direction: Float[Array, "V P"]
     progress: Float[Array, "V P"]
     ttc: Float[Array, "V P"]
     comfort: Float[Array, "V P"]
-    contact: Float[Array, "V P"]  # s to the first contact by the own fault, 1e6 if there is none
+    contact: Float[Array, "V P"]  # s to the first at-fault contact, 1e6 if there is none
 
 
 class _Places(NamedTuple):
-    """Where the bodies are on the centerline, every `LOOK_EVERY` steps: `T2` moments."""
+    """Positions of the bodies on the centerline, every `LOOK_EVERY` steps: `T2` moments."""
 
     s: Float[Array, "V P T2"]  # m, centre
     off: Bool[Array, "V P T2"]  # a corner is off the road
@@ -62,7 +62,7 @@ def _places(road: Road, body: Body, proposals: Proposals, motion: Motion, strict
     s = thin(proposals.s[..., : motion.x.shape[-1]]) + axle
 
     def project(s: Array) -> tuple[Place, Array, Array]:
-        """The way there, how far left of it the centre is, and a better `s`."""
+        """Centerline at `s`, offset of the centre, and a better `s`."""
         place = computed_once(to_cartesian(road.centerline, s, jnp.zeros_like(s)))
         cos, sin = jnp.cos(place.heading), jnp.sin(place.heading)
         dx, dy = x - place.x, y - place.y
@@ -73,7 +73,7 @@ def _places(road: Road, body: Body, proposals: Proposals, motion: Motion, strict
     along = wrap_angle(heading - place.heading)
     c, n = jnp.cos(along), jnp.sin(along)
     half_l, half_w = body.length[:, None, None] / 2, body.width[:, None, None] / 2
-    # offset of the corners if the way goes on with the curvature that it has here
+    # offsets of the corners from a centerline of constant curvature
     corners = []
     for ahead, left in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         u = ahead * half_l * c - left * half_w * n
@@ -101,7 +101,7 @@ def _places(road: Road, body: Body, proposals: Proposals, motion: Motion, strict
 
 
 class _Meetings(NamedTuple):
-    """First contact with every other, and the first one if all go on at their speed."""
+    """First contact with each other vehicle, now or at constant velocity."""
 
     contact: Float[Array, "V P K"]  # moment (of `T2`), or `FAR`
     overlap: Float[Array, "V P K"]  # moment times the number of `TTC` plus which of them, or `FAR`
@@ -109,7 +109,7 @@ class _Meetings(NamedTuple):
 
 @jax.named_scope("pdm_contacts")
 def _meetings(body: Body, motion: Motion, others: Others) -> _Meetings:
-    """Separating axes of all proposals and others at all moments."""
+    """Separating-axis tests of all proposals and others at all moments."""
     thin = lambda values: jnp.moveaxis(values[..., ::LOOK_EVERY], -1, 0)  # noqa: E731
     x, y, heading, v = (thin(values) for values in (motion.x, motion.y, motion.heading, motion.v))
     cos, sin = jnp.cos(heading), jnp.sin(heading)
@@ -158,13 +158,13 @@ def _meetings(body: Body, motion: Motion, others: Others) -> _Meetings:
 def score(
     road: Road, body: Body, others: Others, proposals: Proposals, motion: Motion, strict: bool = False
 ) -> Scores:
-    """nuPlan's closed-loop metrics as PDM scores proposals with them.
+    """nuPlan's closed-loop metrics, as PDM scores proposals.
 
     The product of three multipliers and (5 progress + 5 TTC + 2 comfort) / 12.
     """
     places = computed_once(_places(road, body, proposals, motion, strict))
     meetings = computed_once(_meetings(body, motion, others))
-    # who is about to change lanes minds everybody, also those behind
+    # before a lane change all others count, followers among them
     careful = jnp.repeat(road.worth > 0, len(FRACTIONS), 1)[..., None]
     fault, contact = _faults(body, motion, others, places, meetings, careful)
     no_fault = jnp.where(fault, 0.0, 1.0)
@@ -202,9 +202,9 @@ def _faults(
     meetings: _Meetings,
     careful: Bool[Array, "V P 1"],
 ) -> tuple[Bool[Array, "V P"], Float[Array, "V P"]]:
-    """Contacts by the own fault, and the time of the first, s (nuPlan's classes of collisions).
+    """At-fault contacts, and s to the first of them.
 
-    Who overlaps at the start does not count.
+    By nuPlan's classes of collisions. Vehicles that overlap at the start do not count.
     """
     meets = (meetings.contact < FAR) & (meetings.contact > 0)
     k = jnp.where(meets, meetings.contact, 0).astype(jnp.int32)
@@ -233,7 +233,7 @@ def _faults(
 
 
 def _behind(ahead: Array, left: Array) -> Array:
-    """Within 30 degrees of straight behind."""
+    """Whether the other is within 30 degrees of straight behind."""
     return (ahead < 0) & (3 * left * left < ahead * ahead)
 
 
@@ -244,7 +244,7 @@ def _ttc(
     meetings: _Meetings,
     careful: Bool[Array, "V P 1"],
 ) -> Float[Array, "V P"]:
-    """1, or 0 if the own front comes too near to somebody, 0.9 s at present speeds."""
+    """1, or 0 where the time to collision is below 0.9 s."""
     meets = (meetings.overlap < FAR) & (meetings.contact != 0)
     code = jnp.where(meets, meetings.overlap, 0).astype(jnp.int32)
     k, n = code // len(TTC), code % len(TTC)
@@ -261,7 +261,7 @@ def _ttc(
 
 
 def _direction(motion: Motion, places: _Places) -> Float[Array, "V P"]:
-    """1, or 0.5 from 2 m, or 0 from 6 m in oncoming traffic within a second."""
+    """1; 0.5 from 2 m and 0 from 6 m of oncoming lane driven within a second."""
     window = round(1 / (LOOK_EVERY * DT))
     driven = jnp.where(places.wrong, motion.v[..., ::LOOK_EVERY] * (LOOK_EVERY * DT), 0)
     total = jnp.cumsum(driven, -1)
@@ -291,7 +291,7 @@ def _filters(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def _comfort(body: Body, motion: Motion) -> Float[Array, "V P"]:
-    """1 if all of `COMFORT` is kept, else 0."""
+    """1 if all bounds of `COMFORT` are kept, otherwise 0."""
     count = motion.x.shape[-1]
     of_a, of_heading = _filters(count)
     lateral = motion.v * motion.v * jnp.tan(motion.steering) / body.wheelbase[:, None, None]

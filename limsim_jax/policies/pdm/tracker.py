@@ -29,14 +29,14 @@ _CAR = Limits()
 
 
 def fitted(reference: Poses) -> Poses:
-    """The same with speed and curvature fitted to the poses, as nuPlan's tracker does.
+    """Speed and curvature fitted to the poses, as nuPlan's tracker does.
 
     Regularised least squares: jerk 1e-4, curvature rate 1e-2, initial curvature 1e-10.
     """
     dx, dy = jnp.diff(reference.x), jnp.diff(reference.y)
     heading = reference.heading[..., :-1]
     n = heading.shape[-1]
-    # speed before each step: the first one, and accelerations
+    # speed before each step, from the first speed and the accelerations
     sums = np.concatenate([np.ones((n, 1)), DT * np.tril(np.ones((n, n - 1)), -1)], 1)
     jerk = np.zeros((n - 2, n))
     jerk[np.arange(n - 2), np.arange(1, n - 1)], jerk[np.arange(n - 2), np.arange(2, n)] = -1, 1
@@ -59,7 +59,7 @@ def fitted(reference: Poses) -> Poses:
 
 
 class Motion(NamedTuple):
-    """Proposals as driven: rear axle, `T` moments."""
+    """Tracked proposals: motion of the rear axle at `T` moments."""
 
     x: Float[Array, "V P T"]  # m
     y: Float[Array, "V P T"]
@@ -115,14 +115,14 @@ def lqr(
 
 @jax.named_scope("pdm_track")
 def drive_along(reference: Poses, body: Body, steps: int, strict: bool = False) -> Motion:
-    """Track all proposals with the LQR and move them by a kinematic bicycle.
+    """Track all proposals with the LQR and a kinematic bicycle.
 
-    It is nuPlan's if strict (Euler steps), else that which drives the egos (`traffic.ego.step_free`).
+    The bicycle is nuPlan's if `strict` (Euler steps), otherwise that of the egos (`traffic.ego.step_free`).
     """
     shape = reference.x.shape[:2]
 
     def ahead(values: Array) -> Array:
-        """Windows `[T, V, P, LOOK]`; after the last value it stays."""
+        """Windows `[T, V, P, LOOK]`; the last value is repeated."""
         values = jnp.concatenate([values, jnp.repeat(values[..., -1:], _LOOK + 1, -1)], -1)
         windows = jnp.stack([values[..., k : k + steps] for k in range(_LOOK)])
         return jnp.moveaxis(windows, -1, 0)
@@ -139,7 +139,7 @@ def drive_along(reference: Poses, body: Body, steps: int, strict: bool = False) 
         cos, sin = jnp.cos(along), jnp.sin(along)
         lateral, astray = cos * (y - y0) - sin * (x - x0), wrap_angle(heading - along)
         if not strict:
-            # who is early or late is where the reference is at another time, and that is round the bend
+            # an early or late vehicle is compared with the pose at another time, farther along the bend
             early = cos * (x - x0) + sin * (y - y0)
             lateral, astray = lateral - bends[0] * early * early / 2, astray - bends[0] * early
         wish, rate = lqr(v, steering, lateral, astray, v_ref, list(bends), wheelbase)
