@@ -252,7 +252,7 @@ class Linker:
     # --- resolving ------------------------------------------------------------------------------
 
     def _lane(self, end: End) -> tuple[LaneKey, str] | None:
-        """The sampled lane at an end of a lane record, and which end."""
+        """The sampled lane at one end of a record, and that end."""
         road, section, number, side = end
         side, _, index = side.partition("@")
         if index:

@@ -259,4 +259,4 @@ def distance_to_polyline(xy: Float[Array, "M 2"], points: Float[Array, "K 2"]) -
     """Distance (m) of each point from the nearest place on a polyline."""
     line = shapely.LineString(points)
     shapely.prepare(line)
-    return shapely.distance(shapely.points(xy), line)
+    return np.asarray(shapely.distance(shapely.points(xy), line))
