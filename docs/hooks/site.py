@@ -39,6 +39,7 @@ GENERATED: dict[str, Callable[[], str]] = {
 }
 
 _FIGURES = re.compile(r"^<!-- figures: (\w+) -->$", re.M)
+_SHORT = re.compile(r"<td((?: style=[^>]*)?)>([^<]{1,40})</td>")
 _LINK = re.compile(r"\]\((?!https?://|#)([^)\s]+)\)")
 
 
@@ -63,9 +64,11 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Keep the cells of tables of figures on one line."""
+    """Mark short cells of tables of figures, which stay on one line."""
     del config, files
-    return f'<div class="figures">{html}</div>' if page.file.src_uri.startswith("results/") else html
+    if not page.file.src_uri.startswith("results/"):
+        return html
+    return _SHORT.sub(r'<td class="short"\1>\2</td>', html)
 
 
 def _figures(name: str) -> str:
