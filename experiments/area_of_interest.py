@@ -1,11 +1,11 @@
-"""What the Area of Interest costs and what is lost as it shrinks, against planning for everybody.
+"""Cost and fidelity of the Area of Interest by its size.
 
     python experiments/area_of_interest.py [--seeds 32] [--scenario roundabout]
 
-LimSim-TM drives the ego of the scenario, and more or fewer of the vehicles around it. Cost is the CPU time
-of the run alone, without compiling. Fidelity is how far the outcomes over seeds are from those where
-everybody is planned for (Wasserstein-1); as far are two sets of seeds from each other where everybody is.
-Writes experiments/results/area_of_interest.json and .md.
+LimSim-TM drives the ego of the scenario, and more or fewer of the vehicles around it. Cost is the CPU time of
+the run alone, without compilation. Fidelity is the Wasserstein-1 distance between the outcomes over seeds and
+those with all vehicles planned. The noise level is the distance between two sets of seeds with all vehicles
+planned. Writes experiments/results/area_of_interest.json and .md.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from limsim_jax.xla import enable_compilation_cache, use_all_cores
 
 RESULTS = Path(__file__).parent / "results"
 SLOTS = 40
-"""Vehicles that there is room for in the world, all of which are planned for in the whole."""
+"""Slots of the world; the largest area plans for all of them."""
 
 EVERYWHERE = 1e6
 """m"""
 
 AREAS = ((2, 15.0), (4, 25.0), (8, 50.0), (16, 50.0), (SLOTS, EVERYWHERE))
-"""Vehicles planned for beside the ego, and the radius in m within which."""
+"""Vehicles planned for beside the ego, and the radius, m."""
 
 
 def with_area(experiment: ExperimentFile, slots: int, radius: float) -> ExperimentFile:
-    """The experiment with LimSim-TM at so many wheels beside the ego's."""
+    """The experiment with LimSim-TM for `slots` vehicles beside the ego."""
     options = {"around": "limsim_tm", "slots": slots, "radius": radius}
     ego = experiment.ego.model_copy(update={"options": options})
     return experiment.model_copy(update={"ego": ego, "slots": SLOTS})
@@ -67,7 +67,7 @@ def main() -> None:
     (experiment,) = read_experiments(options.scenario, policy="area_of_interest")
     seeds, rows, whole = range(options.seeds), [], {}
     for slots, radius in reversed(AREAS):
-        every = slots == SLOTS  # with as many seeds more: how far apart are two sets?
+        every = slots == SLOTS  # a second set of seeds gives the noise level
         ran = range(2 * options.seeds) if every else seeds
         found, cost = outcomes(with_area(experiment, slots, radius), ran, options.seeds)
         mine = {name: values[: options.seeds] for name, values in found.items()}

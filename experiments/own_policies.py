@@ -1,4 +1,4 @@
-"""Policies of a user's own, as short as they get: one in JAX, and one on the host.
+"""Short policies of one's own: one in JAX, and one on the host.
 
 The README and `limsim_jax.policies.host` show them. With this folder on the path an experiment can name them:
 
@@ -24,9 +24,8 @@ class Cautious(Policy):
     share: float = 0.8  # of the speed limit
 
     def __call__(self, config, lane_map, state, memory, key):
-        slot = state.egos.slot
-        path = reference_path(lane_map, state, slot)
-        v = jnp.minimum(state.v[slot], self.share * path.limit[:, 0])[:, None]
+        path = reference_path(lane_map, state)
+        v = jnp.minimum(state.v[state.egos.slot], self.share * path.limit[:, 0])[:, None]
         s = v * 0.2 * jnp.arange(16.0)[None]  # m, in 3 s
         trajectory = path.trajectory(s, v, t0=config.time(state.step), dt=0.2)
         return Command(trajectory=trajectory), memory

@@ -1,10 +1,10 @@
-"""The five scenarios of the LimSim Series with every policy: how far, how well, how often without fault.
+"""Results of every policy in the five scenarios of the LimSim Series.
 
     python experiments/policies.py [--seeds 1000] [--policies limsim_tm pdm_closed ...] [--scenarios ramp ...]
 
-Worlds go to results/policies: what was killed goes on where it was, and `limsim-jax report results/policies`
-shows the worst of them. Writes experiments/results/policies.json and .md; policies and scenarios that are not
-named keep their rows. `--paper 10` adds what the first ten seeds alone give, as many as the paper has.
+Worlds go to results/policies. An interrupted run continues there, and `limsim-jax report results/policies`
+shows the worst worlds. Writes experiments/results/policies.json and .md; policies and scenarios that are not
+named keep their rows. `--paper 10` adds the results of the first ten seeds alone, as many as in the paper.
 Decisions are timed by `limsim-jax bench policy`; `--skip decisions` leaves that for a quiet machine. Those of
 `own_policies.py`, one in JAX and one on the host, are timed as well (`--policies own`).
 """
@@ -62,7 +62,7 @@ def worlds(policy: str, scenario: str, seeds: int, few: int, out: Path) -> dict[
 
 
 def decisions(scenario: str, policy: str) -> dict[str, Any]:
-    """How long they take."""
+    """Latency and amortised time of a decision, ms; compile time, s."""
     told = bench_policy(scenario, policy, cold=True)
     return {
         "decision_ms": 1e3 * told["latency_s"],
@@ -73,13 +73,13 @@ def decisions(scenario: str, policy: str) -> dict[str, Any]:
 
 
 def own() -> list[dict[str, Any]]:
-    """How long decisions of a user's policies take, in JAX and on the host."""
+    """Times of decisions of own policies, in JAX and on the host."""
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
     return [{"policy": policy, "scenario": "roundabout"} | decisions("roundabout", policy) for policy in OWN]
 
 
 def summary(found: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Shares and means with their 95 % intervals, the seed is the unit; and what happened to others."""
+    """Shares and means with 95 % intervals, and collisions of others."""
     row: dict[str, Any] = {}
     for name in EVENTS:
         events, seeds = int(np.sum(found[name] > 0)), len(found[name])
@@ -107,7 +107,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/policies"))
     options = parser.parse_args()
     if options.seeds < 1:
-        parser.error(f"--seeds {options.seeds}: at least 1")
+        parser.error(f"--seeds {options.seeds}: expected at least 1")
     use_all_cores()
     enable_compilation_cache()
     file = RESULTS / "policies.json"

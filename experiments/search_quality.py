@@ -1,9 +1,9 @@
-"""How well the search of LimSim-TM decides, and how fast, next to others of its kind.
+"""Quality and speed of LimSim-TM's search beside other searches.
 
     taskset -c 0 python experiments/search_quality.py [--scenes 128] [--quick]
 
-Times are CPU times, of one core if run like this. Writes experiments/results/search_quality.json and .md.
-All searches drive the same model of the road; what they find is judged by driving the plan.
+Times are CPU times, of one core if run like this. Writes experiments/results/search_quality.json and .md. All
+searches use the same model of the road, and are judged by driving their plans.
 """
 
 from __future__ import annotations
@@ -59,7 +59,10 @@ def road(
     steps: int = Settings().steps,
     dt: float = Settings().dt,
 ) -> Scene:
-    """Vehicles `(s, v, lane)` on one road; the others keep their speed. `wanted`: the lane of each."""
+    """Vehicles `(s, v, lane)` on one road; the others keep their speed.
+
+    `wanted` is the lane that each vehicle wants.
+    """
     count, number = len(own), max(len(others), 1)
     s, v, lane = (np.asarray(column) for column in zip(*own, strict=True))
     rest = np.asarray(others or [(0, 0, 0)], float)
@@ -104,7 +107,7 @@ def road(
 
 
 def crowded(seed: int, vehicles: int = 3, others: int = 8, **kwargs: Any) -> Scene:
-    """Random traffic on three lanes around the first vehicle; each wants to a random lane."""
+    """Random traffic on three lanes; each vehicle wants a random lane."""
     random = np.random.default_rng(seed)
     found: list[tuple[float, float, int]] = []
     while len(found) < vehicles + others:
@@ -118,7 +121,7 @@ def crowded(seed: int, vehicles: int = 3, others: int = 8, **kwargs: Any) -> Sce
 
 
 def merge(seed: int, svo: float) -> Scene:
-    """A vehicle whose lane ends, and one of that orientation on the lane that it must change to."""
+    """A merge: a vehicle whose lane ends, and one with `svo` on the through lane."""
     random = np.random.default_rng(seed)
     v = random.uniform(11, 14)
     own = [(0.0, v, 0), (random.uniform(-14, 2), v + random.uniform(-1, 1.5), 1)]
@@ -156,7 +159,7 @@ _Root: Any = mctx.RootFnOutput
 def by_mctx(policy: str, settings: Settings, scenes: Scene) -> Plan:
     """Search over joint actions: one tree over 5^G arms for the mean reward of the group.
 
-    A leaf is worth what the default policy earns from there on, as in ours.
+    The value of a leaf is the reward of the default policy from there on, as in our search.
     """
     batch, count = scenes.s.shape
     depth, arms = settings.decisions, ACTIONS**count
@@ -229,7 +232,7 @@ def by_mctx(policy: str, settings: Settings, scenes: Scene) -> Plan:
 
 
 def timed(function: Callable[..., Any], *of: Any, repeat: int = 5) -> tuple[Any, float, float]:
-    """Result, CPU seconds of the fastest call, CPU seconds to trace and compile."""
+    """Result, CPU seconds of the fastest call, and those of compilation."""
     begin = time.process_time()
     program = jax.jit(function).lower(*of).compile()
     compiled = time.process_time() - begin
@@ -243,7 +246,7 @@ def timed(function: Callable[..., Any], *of: Any, repeat: int = 5) -> tuple[Any,
 
 
 def against_enumeration(scenes: int, simulations: Sequence[int]) -> list[dict[str, Any]]:
-    """How far the plan is from the best of all, for one vehicle and for two that want the same."""
+    """Regret against the best of all plans, for one and two vehicles."""
     rows = []
     for vehicles, decisions in ((1, 3), (1, 4), (2, 2)):
         base = Settings(decisions=decisions)
@@ -270,7 +273,7 @@ def against_enumeration(scenes: int, simulations: Sequence[int]) -> list[dict[st
 
 
 def against_joint(scenes: int, cases: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:
-    """Reward and collisions of the plans for three vehicles in a crowd, and time for a group."""
+    """Reward, collisions and time of plans for three vehicles in a crowd."""
     batch = stacked([crowded(1000 + k) for k in range(scenes)])
     free = jax.jit(jax.vmap(lambda s: play(Settings(), s, jnp.full((3, Settings().decisions), -1))))(batch)
     rows = [_judged("default policy", 0, free, 0.0, 0.0)]
@@ -296,7 +299,7 @@ def _judged(method: str, n: int, plan: Plan, seconds: float, compiled: float) ->
 
 
 def orientation(scenes: int, simulations: int) -> list[dict[str, Any]]:
-    """What a merging vehicle meets, by the social value orientation of the one on the through lane."""
+    """Outcome of a merge by social value orientation."""
     rows = []
     settings = Settings(simulations=simulations)
     run = jax.jit(lambda b: decide(settings, b))

@@ -40,6 +40,10 @@ class ReferencePath:
         """m from the first point to the last."""
         return self.step * (self.x.shape[-1] - 1)
 
+    def at(self, s: Float[Array, "V ..."], d: Float[Array, "V ..."] | float = 0.0) -> Place:
+        """Points `s` m along and `d` m left of each path; see `to_cartesian`."""
+        return to_cartesian(self, s, jnp.broadcast_to(jnp.asarray(d, s.dtype), s.shape))
+
     def trajectory(
         self,
         s: Float[Array, "V H"],
@@ -57,8 +61,7 @@ class ReferencePath:
           dt: s between samples.
           d: m left of the path.
         """
-        place = to_cartesian(self, s, jnp.broadcast_to(jnp.asarray(d, s.dtype), s.shape))
-        v = jnp.broadcast_to(v, s.shape)
+        place, v = self.at(s, d), jnp.broadcast_to(v, s.shape)
         return Trajectory(x=place.x, y=place.y, heading=place.heading, v=v, t0=t0, dt=dt)
 
 
@@ -140,17 +143,23 @@ def path_from(
 
 
 def reference_path(
-    lane_map: LaneMap, state: State, slot: Int[Array, " V"], *, points: int = 60, step: float = 2.0
+    lane_map: LaneMap,
+    state: State,
+    slot: Int[Array, " V"] | None = None,
+    *,
+    points: int = 60,
+    step: float = 2.0,
 ) -> ReferencePath:
-    """Reference paths of the vehicles in these slots, along their routes.
+    """Reference paths of the egos, or of the vehicles in `slot`.
 
     Args:
       lane_map: the map.
       state: the world now.
-      slot: of the vehicles, such as `state.egos.slot`.
+      slot: of the vehicles; None: those of the egos.
       points: of each path.
       step: m between points.
     """
+    slot = state.egos.slot if slot is None else slot
     lane, s = center_lane(lane_map, state, slot)
     after = jnp.where(lane == state.lane[slot], NO_LANE, state.lane[slot])
     return path_from(lane_map, lane, s, state.goal[slot], points=points, step=step, after=after)

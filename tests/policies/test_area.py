@@ -1,4 +1,4 @@
-"""The area of interest: who gets a place, hand-overs without a jump, and the same traffic as without."""
+"""The area of interest: assignment of places, hand-overs without a jump, unchanged traffic."""
 
 import dataclasses
 import functools
@@ -56,7 +56,7 @@ def away(state):
     return np.hypot(*(here - here[2]).T)
 
 
-def test_the_nearest_within_the_radius_get_the_places():
+def test_the_nearest_vehicles_within_the_radius_get_the_places():
     state = crowd()
     policy = area(radius=90.0)
     memory = policy.init(CONFIG, bundled("roundabout")[1], state)
@@ -74,7 +74,7 @@ def test_the_nearest_within_the_radius_get_the_places():
     nearest = sorted(np.nonzero(fit & (distance < 90.0))[0], key=lambda k: distance[k])[:PLACES]
     assert sorted(got) == sorted(int(k) for k in nearest)
     assert int(found.switches) == len(got)
-    # nobody near: nobody gets a place
+    # without vehicles nearby no place is given
     alone = chosen(area(radius=1e-3), state, memory, 0.0)
     assert (alone.slot == -1).all()
 
@@ -91,7 +91,7 @@ def test_places_are_kept_for_a_while_and_given_up_far_away():
     np.testing.assert_array_equal(first.slot, young.slot)
     old = chosen(narrow, state, first, 14.0)
     assert (old.slot == -1).all() and int(old.switches) == 2 * int(first.switches)
-    # between two lanes nobody is left alone: the traffic would see him on one of them only
+    # between two lanes a vehicle keeps its place: the traffic would see it on one of them only
     a, b = (int(k) for k in first.slot[:2])
     between = dataclasses.replace(state, d=state.d.at[a].set(-1.5), side=state.side.at[b].set(1))
     np.testing.assert_array_equal(chosen(narrow, between, first, 14.0).slot[:2], [a, b])
@@ -103,7 +103,7 @@ def test_places_are_kept_for_a_while_and_given_up_far_away():
     ).any()
 
 
-def test_a_vehicle_that_is_taken_starts_where_it_is_and_goes_on_from_there():
+def test_a_vehicle_that_gets_a_place_continues_from_its_position():
     lane_map = bundled("roundabout")[1]
     state = crowd()
     box = boxes(lane_map, state)
@@ -141,7 +141,7 @@ def runs():
     return found
 
 
-def test_nobody_jumps_at_a_hand_over_and_nobody_is_hit():
+def test_hand_overs_cause_no_jump_and_no_contact():
     plain, with_area = runs()
     assert (with_area.state.egos.slot[:, 1:] >= 0).any()
     for result in (plain, with_area):
@@ -165,7 +165,7 @@ def test_traffic_is_the_same_with_the_area_driven_like_traffic():
         assert two == pytest.approx(one, rel=0.02), name
 
 
-def test_options_that_make_no_sense_are_refused():
+def test_wrong_options_are_refused():
     with pytest.raises(ValueError, match="slots: 0; expected at least 1"):
         AreaOfInterest(FollowLane(), slots=0)
     with pytest.raises(ValueError, match="radius"):

@@ -40,9 +40,8 @@ class Cautious(Policy):
     share: float = 0.8
 
     def __call__(self, config, lane_map, state, memory, key):
-        slot = state.egos.slot
-        path = reference_path(lane_map, state, slot)
-        v = jnp.minimum(state.v[slot], self.share * path.limit[:, 0])[:, None]
+        path = reference_path(lane_map, state)
+        v = jnp.minimum(state.v[state.egos.slot], self.share * path.limit[:, 0])[:, None]
         s = v * 0.2 * jnp.arange(16.0)[None]
         return Command(trajectory=path.trajectory(s, v, t0=config.time(state.step), dt=0.2)), memory
 
@@ -91,13 +90,14 @@ def test_policies_without_the_base_class_are_policies():
     check_policy(Ducky(), CONFIG, lane_map, state)
 
 
-def test_settings_of_an_undecorated_class_tell_its_objects_apart():
+def test_an_undecorated_class_can_set_attributes_and_is_equal_to_itself_alone():
     class Plain(Cautious):
         def __init__(self, gain):
             super().__init__()
             self.gain = gain
 
-    assert Plain(0.8).gain == 0.8
+    first = Plain(0.8)
+    assert first.gain == 0.8 and first == first and first != Plain(0.6)
 
 
 @pytest.mark.parametrize(("name", "factory"), list(POLICIES.items()))
@@ -222,7 +222,7 @@ def steer(count: int):
         (lambda state: None, "a policy has methods init and __call__"),
     ],
 )  # fmt: skip
-def test_a_wrong_policy_is_told_so_in_one_line(policy, message):
+def test_a_wrong_policy_gets_a_message_of_one_line(policy, message):
     lane_map, state = world()
     with pytest.raises(ValueError) as caught:
         check_policy(policy, CONFIG, lane_map, state)

@@ -39,13 +39,13 @@ def example():
 
 
 def follow(seen):
-    """The same, and notes how many worlds it was called for."""
+    """The same, which records for how many worlds it was called."""
     calls.append(seen.v.shape)
     return example()(seen)
 
 
 def follower() -> HostPolicy:
-    """What an experiment file names."""
+    """The factory that an experiment file names."""
     return HostPolicy(follow)
 
 
@@ -115,7 +115,7 @@ def test_one_call_per_decision_for_all_worlds():
     assert np.abs(end.d[:, 0]).max() < 0.3
 
 
-def test_it_runs_where_batches_are_shared_among_devices():
+def test_it_runs_with_batches_spread_over_devices():
     lane_map = bundled("highway")[1]
     worlds = Worlds(rollout(follower(), 2.0), lane_map, scenario, chunk=3)
     worlds.run_totals([5])
@@ -125,7 +125,7 @@ def test_it_runs_where_batches_are_shared_among_devices():
     assert (totals.distance > 0).all() and not totals.collided.any()
 
 
-def test_the_observation_is_what_there_is():
+def test_the_observation_agrees_with_the_state():
     lane_map = bundled("highway")[1]
     state = world(25.0, 18.0)
     seen = jax.jit(lambda state: Observe(nearest=3, points=10)(CONFIG, lane_map, state))(state)
@@ -207,7 +207,7 @@ def gives(found, **more):
         ),
     ],
 )
-def test_what_is_wrong_is_said_before_anything_is_compiled(policy, message):
+def test_errors_are_reported_before_anything_is_compiled(policy, message):
     with pytest.raises(ValueError, match=message) as caught:
         policy.init(CONFIG, bundled("highway")[1], world(20.0, 10.0))
     assert "\n" not in str(caught.value)

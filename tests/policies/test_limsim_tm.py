@@ -45,7 +45,7 @@ def entrance():
     return lane, int(lane_map.left[lane]), goal
 
 
-def test_a_corridor_knows_which_lanes_lead_on():
+def test_a_corridor_knows_the_lanes_that_lead_to_the_goal():
     lane_map = bundled("ramp")[1]
     lane, beside, goal = entrance()
     rows, places = jnp.asarray([lane, beside]), jnp.asarray([40.0, 55.0])
@@ -58,7 +58,7 @@ def test_a_corridor_knows_which_lanes_lead_on():
     assert int(found.wanted_right[1]) == 0 and int(found.right[1]) in (0, 1)
 
 
-def test_groups_take_in_neighbours_once():
+def test_groups_include_each_neighbor_once():
     lane = entrance()[1]
     state = state_of("ramp", [lane] * 4, [60.0, 80.0, 100.0, 250.0], [20.0] * 4, [0] * 4)
     lane_map = bundled("ramp")[1]
@@ -107,7 +107,7 @@ def test_an_ego_gets_through_traffic():
     assert np.isfinite(result.trace.box).all()
 
 
-def test_who_is_planned_for_knows_what_the_others_chose():
+def test_planned_vehicles_know_the_trajectories_of_the_others():
     lane_map = bundled("ramp")[1]
     lane = entrance()[1]
     state = state_of("ramp", [lane] * 3, [60.0, 110.0, 160.0], [20.0, 14.0, 20.0], [0] * 3)
@@ -136,8 +136,8 @@ def test_who_is_planned_for_knows_what_the_others_chose():
     assert replace(policy, shares=False).init(config, lane_map, state).plan is None
 
 
-def test_a_change_that_can_wait_does_not_begin_shortly_before_a_junction():
-    """Else one stands between two lanes at the entry of a roundabout, half in the way of those beside."""
+def test_an_optional_lane_change_does_not_begin_shortly_before_a_junction():
+    """Otherwise the vehicle stops between two lanes at the entry of a roundabout."""
     network, lane_map = bundled("long_route")
     routes, (goal, lane) = lane_map.routes, (2, lane_rows(network)["7_0_-3"])
     length = float(lane_map.length[lane])

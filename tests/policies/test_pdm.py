@@ -109,7 +109,7 @@ def loop_idm(v, limit, front, wide, half, seen, wall, strict):
 
 
 @pytest.mark.parametrize("strict", [False, True])
-def test_idm_as_a_loop_has_it(strict):
+def test_idm_agrees_with_a_loop(strict):
     x, y, u = [40.0, 25.0, 70.0, -9.0, 60.0, 30.0], [0.2, 2.3, -1.9, 0.0, 14.0, 3.6], [5.0, 9, 2, 20, 6, 9]
     heading = [0.0, 0.05, 0.0, 0.0, -1.4, -0.02]
     me, road = body((12.0, 7.0)), straight_road(wall=95.0)
@@ -122,12 +122,12 @@ def test_idm_as_a_loop_has_it(strict):
         np.testing.assert_allclose(found.s[i], wanted[..., 0], atol=2e-3)
         np.testing.assert_allclose(found.v[i], wanted[..., 1], atol=2e-3)
     gaps = 40 - 2.25 + 5.0 * 4 - np.asarray(found.s)[0, :5, -1] - 4.0
-    assert (gaps > 1).all() and gaps[0] > gaps[4], "nobody runs into the first one; the slow keep back"
+    assert (gaps > 1).all() and gaps[0] > gaps[4], "no driver hits the leader; slow drivers keep a larger gap"
 
 
-def test_who_is_too_near_brakes_hard():
+def test_a_gap_below_the_standstill_gap_means_hard_braking():
     me, road = body((1.5, 1.5), d=(0.0, 0.0)), straight_road(wall=95.0)
-    rear = float(me.front[0]) + 1.0  # 1 m ahead stands somebody
+    rear = float(me.front[0]) + 1.0  # a standing vehicle 1 m ahead
     seen = others([rear + 2.25], [0.0], [0.0])
     distance = []
     for strict in (False, True):
@@ -188,7 +188,7 @@ def test_the_tracker_stays_on_a_circle():
     np.testing.assert_allclose(motion.steering[..., -1], np.repeat(ackermann[:, None], P, 1), rtol=0.05)
 
 
-def test_the_bicycle_is_that_which_drives_the_egos():
+def test_the_bicycle_is_that_of_the_egos():
     """A slalom whose wheels turn as fast as they can: each step is one of the simulator's."""
     me = body((9.0, 9.0), d=(0.0, 0.0))
     wave = arc(9.0, 30.0)
@@ -211,8 +211,8 @@ def test_the_bicycle_is_that_which_drives_the_egos():
     np.testing.assert_allclose(np.hypot(np.diff(motion.x), np.diff(motion.y)), distance, atol=1e-4)
 
 
-def test_who_brakes_late_keeps_to_the_bend():
-    """The tracker brakes later than its reference: it is ahead of it, round the bend."""
+def test_late_braking_keeps_to_the_bend():
+    """The tracker brakes later than the proposal, and is then farther along the bend."""
     me = body((8.0, 8.0), d=(0.0, 0.0))
     me = me._replace(steering=jnp.arctan(me.wheelbase / 15.0))
     late = arc(np.maximum(8.0 - 3.0 * 0.1 * np.arange(81), 3.0), 15.0)
@@ -224,7 +224,7 @@ def test_who_brakes_late_keeps_to_the_bend():
 
 
 def test_the_bicycle_drives_a_circle():
-    """Who is on it with the right steering stays on it; nuPlan's Euler steps drift outwards."""
+    """With the right steering it stays on the circle; nuPlan's Euler steps drift outwards."""
     me = body((20.0, 20.0), d=(0.0, 0.0))
     me = me._replace(steering=jnp.arctan(me.wheelbase / 300.0))
     off = []
@@ -283,7 +283,7 @@ def test_a_free_road_is_scored_by_progress_alone():
     np.testing.assert_allclose(found["progress"][0], speeds / 12, rtol=1e-4)
     np.testing.assert_allclose(found["total"][0], (5 * speeds / 12 + 5 + 2) / 12, rtol=1e-4)
     still = scored(paths(0.01), *FAR_AWAY)
-    assert (still["progress"] == 1).all(), "where nobody gets on, nobody is worse"
+    assert (still["progress"] == 1).all(), "without progress all proposals are equal"
 
 
 def test_edges_of_the_road():
@@ -302,7 +302,7 @@ def test_edges_of_the_road():
     np.testing.assert_array_equal(drifts["direction"][0, :3], [1.0, 0.5, 0.0])
 
 
-def test_contacts_and_whose_fault_they_are():
+def test_contacts_and_fault():
     lanes = np.zeros(P)
     lanes[3], lanes[4] = 1.0, 3.5
     motion = paths(np.where(np.arange(P) == 2, 0.0, 10.0), lanes)
@@ -312,20 +312,20 @@ def test_contacts_and_whose_fault_they_are():
     # front at 4 m, rear at 27.75 m, 10 m/s: contact after 2.375 s, seen every 0.2 s
     assert found["contact"][0, 0] == pytest.approx(2.4) and found["contact"][0, 4] > 1e5
     assert (found["total"][0, [0, 1, 3]] == 0).all()
-    # from behind, faster: not our fault, whether we drive or stand
+    # from behind and faster: not at fault, driving or standing
     found = scored(motion, [-12.0], [0.0], [18.0])
     np.testing.assert_array_equal(found["no_fault"][0], np.ones(P))
-    # who stands is not at fault even if it is hit in the front
+    # a standing vehicle is not at fault, even if it is hit in the front
     found = scored(motion, [20.0], [0.0], [6.0], heading=[np.pi])
     np.testing.assert_array_equal(found["no_fault"][0, :4], [0, 0, 1, 0])
-    # from the side, level with us: the fault is ours only if we are over the line
+    # from the side, level with the ego: at fault only over the lane line
     side = [0.5], [-4.3], [2.0]
     found = scored(paths(2.0, lanes), *side, heading=[0.3])
     assert found["no_fault"][0, 0] == 1 and found["contact"][0, 0] > 1e5
     over = np.where(np.arange(P) == 1, -1.0, 0.0)
     found = scored(paths(2.0, over), *side, heading=[0.3])
     np.testing.assert_array_equal(found["no_fault"][0, :2], [1, 0])
-    # who overlaps from the start does not count
+    # a vehicle that overlaps from the start does not count
     found = scored(paths(3.0), [3.0], [1.0], [3.0])
     assert (found["no_fault"][0] == 1).all() and (found["ttc"][0] == 1).all()
 
@@ -341,12 +341,12 @@ def test_time_to_collision():
     found = scored(paths(speeds), [front + 19.0 + 2.25], [0.0], [6.0])
     np.testing.assert_array_equal(found["ttc"][0, :2], [0, 1])
     assert found["no_fault"][0, 0] == 1
-    # somebody who comes up behind is not ours to mind
+    # a follower that comes nearer does not count
     found = scored(paths(speeds), [-19.0], [0.0], [14.0])
     np.testing.assert_array_equal(found["ttc"][0, :2], [1, 1])
 
 
-def test_meetings_are_what_boxes_say():
+def test_meetings_agree_with_overlapping_boxes():
     rng = np.random.default_rng(3)
     x, y, v = rng.uniform(-20, 40, K), rng.uniform(-12, 12, K), rng.uniform(0, 10, K)
     heading = rng.uniform(-3, 3, K)
@@ -471,10 +471,10 @@ def test_red_stops_and_red_far_ahead_does_not_slow_now():
     far = planned("intersection", at_light(SignalState.RED, 90.0, 8.0))
     assert np.asarray(far.trajectory.v)[0, 10] > 8.5
     late = planned("intersection", at_light(SignalState.RED, 5.0, 12.0))
-    assert np.asarray(late.trajectory.v)[0, 10] > 10, "who cannot stop any more drives on"
+    assert np.asarray(late.trajectory.v)[0, 10] > 10, "a vehicle that can no longer stop drives on"
 
 
-def test_yellow_stops_who_can_stop():
+def test_yellow_stops_a_vehicle_that_can_stop():
     can = planned("intersection", at_light(SignalState.YELLOW, 40.0, 12.0))
     cannot = planned("intersection", at_light(SignalState.YELLOW, 15.0, 12.0))
     assert np.asarray(can.trajectory.v)[0, -1] < 6 < 11 < np.asarray(cannot.trajectory.v)[0, -1]
@@ -512,7 +512,7 @@ def test_emergency_brake():
     np.testing.assert_allclose(np.asarray(strict.trajectory.v)[0, 1:], 1.1 * (4.9 - 4.05), atol=1e-3)
 
 
-def test_it_comes_back_to_its_lane_however_often_it_plans_anew():
+def test_it_returns_to_its_lane_however_often_it_plans():
     """Planned anew ten times a second, as the public implementation is, an ego 0.8 m off its lane."""
     state, lane_map = behind(150.0, 15.0, 15.0), bundled("highway")[1]
     egos = state.egos
@@ -550,7 +550,7 @@ def test_conventions_of_the_public_implementation():
     assert np.hypot(x, y).max() < 2.0
 
 
-def test_who_changes_lanes_signals_and_keeps_the_body_on_the_road():
+def test_a_lane_change_is_signalled_and_keeps_the_body_on_the_road():
     """On the entrance lane of the ramp, which ends, and on a lane at the right edge of the road behind it."""
     lane_map = bundled("ramp")[1]
     goal = 0
@@ -574,7 +574,7 @@ def test_who_changes_lanes_signals_and_keeps_the_body_on_the_road():
     np.testing.assert_allclose(ours, [0, -free, 1], atol=0.01)
 
 
-def test_unused_rows_and_empty_slots_do_no_harm():
+def test_unused_rows_and_empty_slots_are_harmless():
     state = behind(25.0, 15.0, 10.0)
     alone = planned("highway", state)
     policy = PDMClosed(seen=K)

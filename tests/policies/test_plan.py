@@ -1,4 +1,4 @@
-"""Trajectories of LimSim-TM: boundary conditions, bounds, and what is seen ahead."""
+"""Trajectories of LimSim-TM: boundary conditions, bounds, and what lies ahead."""
 
 import functools
 from typing import Any
@@ -120,7 +120,7 @@ def test_samples_differ_along_and_across():
 
 
 @pytest.mark.parametrize("d, slope", [(0.0, 0.0), (0.6, -0.05), (-1.4, 0.02)])
-def test_what_is_chosen_keeps_its_bounds(d, slope):
+def test_the_chosen_sample_keeps_its_bounds(d, slope):
     bends = (0.0, 0.015, -0.03, 0.06)
     v = np.array([14.0, 11.0, 8.0, 5.5])
     case = task(bends, v=v, d=d, slope=slope)
@@ -135,7 +135,7 @@ def test_what_is_chosen_keeps_its_bounds(d, slope):
     assert (np.abs(bend) * speed[:, 1:] ** 2).max() < 2.5 + 1.2
     a = np.diff(chosen.v) / t
     assert a.max() < 4.0 and a.min() > -8.5
-    # the lane ends 1.9 m to the right of the way: the body stays inside
+    # the lane ends 1.9 m to the right of the path: the body stays inside
     heading = np.asarray(chosen.heading)
     np.testing.assert_allclose(np.cos(course - (heading[:, 1:] + heading[:, :-1]) / 2), 1, atol=2e-3)
 
@@ -143,14 +143,14 @@ def test_what_is_chosen_keeps_its_bounds(d, slope):
 @pytest.mark.parametrize(
     "bend, d, slope", [(0.0, -1.0, -0.14), (0.0, -0.9, -0.2), (-0.14, 0.4, 0.17), (-0.14, 0.5, 0.32)]
 )
-def test_who_stands_askew_turns_the_wheels_and_drives_on(bend, d, slope):
+def test_a_vehicle_at_rest_and_askew_turns_the_wheels_and_drives_on(bend, d, slope):
     """With the right corner over the edge, or straight on in a bend nearly as tight as the wheels allow."""
     case = task((bend, -bend), v=0.0, d=np.array([d, 0.0]), slope=np.array([slope, 0.0]))
     start = case.start._replace(bend=jnp.asarray([-bend, 0.0], jnp.float32))  # the wheels are straight
     chosen = planned(case._replace(start=start))
     assert chosen.safe.all()
     went = np.hypot(*(np.diff(np.asarray(x)[:, [0, -1]])[:, 0] for x in (chosen.x, chosen.y)))
-    assert (went > 3.0).all(), "standing breaks no bound, and would be for ever"
+    assert (went > 3.0).all(), "staying at rest breaks no bound, and would last for ever"
 
 
 def test_envelope_slows_for_bends_limits_and_walls():
@@ -166,17 +166,17 @@ def test_envelope_slows_for_bends_limits_and_walls():
 
 def test_a_line_far_ahead_does_not_slow_and_a_near_one_stops():
     free, far, near = (planned(task(v=10.0, wall=wall)) for wall in (NO_GAP, 140.0, 30.0))
-    # car following would mind it a little already; another sample that does not is at hand
+    # car following would brake a little already; another sample does not
     assert (np.diff(far.v[0]) > -0.01).all() and far.x[0, -1] > 0.95 * free.x[0, -1]
     assert free.v[0, -1] > 12
-    way_gone = np.asarray(near.x[0, -1])
-    assert way_gone <= 30.3 and near.v[0, -1] < 4
+    distance = np.asarray(near.x[0, -1])
+    assert distance <= 30.3 and near.v[0, -1] < 4
     blocked = planned(task(v=10.0, wall=3.0))
     np.testing.assert_allclose(np.diff(blocked.v[0, :5]), -8 * LATTICE.dt, atol=0.01)
     assert not blocked.safe[0]
 
 
-def test_who_stands_moves_up_to_the_line_without_delay():
+def test_a_vehicle_at_rest_moves_up_to_the_line_without_delay():
     """7 m from rest to rest take 5.2 s at 1.5 m/s^2 at most; replanned every 0.4 s, a little more."""
     wall, v, a, decisions = 7.0, 0.0, 0.0, 0
     while wall > 0.5 and decisions < 40:
@@ -200,11 +200,13 @@ def test_leaders_go_on_braking_to_a_standstill():
     far, v = leaders(case, jnp.array([[0.0, 2.0, 10.0]]))
     np.testing.assert_allclose(far[0, :, 0], [20.0, 20 + 20 - 4, 20 + 25], rtol=1e-5)
     np.testing.assert_allclose(v[0, :, 0], [10.0, 6.0, 0.0], atol=1e-5)
-    far, v = leaders(task(lead=(20.0, 10.0, 1.0)), jnp.array([[5.0]]))  # nobody is counted on to speed up
+    far, v = leaders(
+        task(lead=(20.0, 10.0, 1.0)), jnp.array([[5.0]])
+    )  # a leader is not assumed to accelerate
     assert (float(far[0, 0, 0]), float(v[0, 0, 0])) == (70.0, 10.0)
 
 
-def test_a_leader_that_brakes_hard_is_braked_for():
+def test_braking_behind_a_leader_that_brakes_hard():
     """Where its present speed alone would allow to brake mildly."""
     mild, hard = (planned(task(v=18.7, lead=(13.0, 12.5, a))) for a in (0.0, -3.9))
     assert mild.v[0, 5] > 14.5
@@ -214,8 +216,8 @@ def test_a_leader_that_brakes_hard_is_braked_for():
 
 
 @pytest.mark.parametrize("urgency", [0.0, 1.0])
-def test_a_queue_far_ahead_is_braked_for_in_time(urgency):
-    """From 27 m/s to who stands 140 m ahead, planned anew twice a second; also who has to change lanes."""
+def test_braking_in_time_behind_a_queue_far_ahead(urgency):
+    """From 27 m/s to a vehicle at rest 140 m ahead, planned twice a second; also with a lane change."""
     gap, v, a, hardest = 140.0, 27.0, 0.0, 0.0
     for _ in range(30):
         queue = task(v=v, a=a, lead=(gap, 0.0), limit=33.0)
@@ -228,7 +230,7 @@ def test_a_queue_far_ahead_is_braked_for_in_time(urgency):
     assert v < 1.0 and 1.5 < gap < 12
 
 
-def test_who_needs_a_gap_keeps_its_speed_until_it_has_to_stop():
+def test_a_merging_vehicle_keeps_its_speed_until_it_has_to_stop():
     """Braking late and firmly at the end of its lane, against early and mildly at a line."""
     case = task(v=20.0, limit=25.0, wall=150.0)
     pressed = case._replace(merge=case.merge._replace(urgency=jnp.full(1, 0.2)))
@@ -244,7 +246,7 @@ def test_who_needs_a_gap_keeps_its_speed_until_it_has_to_stop():
 
 
 def crossing(arrival):
-    """Somebody who is at (40, 0) `arrival` s from now, from the right, at 9 m/s."""
+    """A vehicle from the right at 9 m/s that reaches (40, 0) `arrival` s from now."""
     t = np.asarray(LATTICE.times())
     shape = (1, K, LATTICE.moments)
     x, y = np.full(shape, 1e4), np.full(shape, 1e4)
@@ -258,7 +260,7 @@ def crossing(arrival):
     )  # fmt: skip
 
 
-def test_crossing_traffic_that_is_far_now_and_meets_later_is_seen():
+def test_crossing_traffic_that_is_still_far_away_counts():
     alone = planned(task(v=12.0))
     at = float(np.interp(40.0, alone.x[0], LATTICE.times()))
     others = crossing(at)  # would meet there and then, 30 m away now

@@ -42,7 +42,7 @@ def world(name, seed=0):
 
 @jax.jit
 def moved(lane_map, state):
-    """The engine's boxes at the times, if nobody accelerates; and who is still there."""
+    """The engine's boxes at the times without acceleration, and which vehicles are active."""
 
     def step(state, _):
         state, _, _ = advance(CONFIG, lane_map, state, jnp.zeros_like(state.v))
@@ -57,7 +57,7 @@ predict = jax.jit(along_route)
 
 
 @pytest.mark.parametrize("name", ["highway", "intersection"])
-def test_constant_velocity_is_what_the_engine_does_without_acceleration(name):
+def test_along_route_is_the_engine_without_acceleration(name):
     state, lane_map = world(name), bundled(name)[1]
     found = predict(lane_map, state, TIMES)
     box, active = (np.asarray(x) for x in moved(lane_map, state))
@@ -69,7 +69,7 @@ def test_constant_velocity_is_what_the_engine_does_without_acceleration(name):
     np.testing.assert_array_equal(found.length, state.shape.length)
 
 
-def test_what_came_to_pass_is_recalled_from_where_vehicles_are_now():
+def test_replayed_motion_continues_from_present_positions():
     state, lane_map = world("highway"), bundled("highway")[1]
     here = np.asarray(boxes(lane_map, state))
     t = np.arange(1, 81)[:, None] * 0.1  # rows are after steps
@@ -108,7 +108,7 @@ def test_offset_fades_and_stop_is_kept():
     assert way[3].max() < 4.4 and way[4, -1] == pytest.approx(60.0, rel=1e-2)
 
 
-def test_plans_override_those_they_are_for():
+def test_plans_replace_predictions():
     state, lane_map = world("highway"), bundled("highway")[1]
     line = jnp.broadcast_to(jnp.arange(9.0), (2, 9))
     plans = Plans(slot=jnp.array([4, -1]), x=line, y=line + 1, heading=line * 0)
@@ -119,7 +119,7 @@ def test_plans_override_those_they_are_for():
     np.testing.assert_array_equal(np.asarray(found.x)[others], np.asarray(free.x)[others])
 
 
-def test_what_is_shared_goes_on_from_where_the_vehicle_is():
+def test_shared_plans_continue_from_present_positions():
     state, lane_map = world("roundabout", 1), bundled("roundabout")[1]
     box = np.asarray(boxes(lane_map, state))
     # chosen at 7 s, it is 7.5 s now: an arc of 30 m to the left, at 6 m/s, for 4 s
@@ -154,7 +154,7 @@ def test_what_is_shared_goes_on_from_where_the_vehicle_is():
     np.testing.assert_array_equal(np.asarray(found.x)[others], np.asarray(free.x)[others])
 
 
-def test_straight_goes_along_the_heading():
+def test_constant_velocity_keeps_the_heading():
     state, lane_map = world("roundabout", 1), bundled("roundabout")[1]
     found, box = constant_velocity(lane_map, state, TIMES), np.asarray(boxes(lane_map, state))
     t, v = np.asarray(TIMES)[None], np.asarray(state.v)[:, None]

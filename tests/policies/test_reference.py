@@ -1,4 +1,4 @@
-"""The way ahead as points: against a walk along the lanes, and the engine's own motion."""
+"""Reference paths: against a walk along the lanes, and the engine's own motion."""
 
 import dataclasses
 
@@ -74,7 +74,7 @@ def test_points_are_those_of_a_walk_along_the_lanes():
         assert ends > 0
 
 
-def test_the_lane_that_the_front_is_on_counts():
+def test_a_known_next_lane_counts():
     """The body is on a lane from which the route would go elsewhere than where the front already is."""
     lane_map = bundled("roundabout")[1]
     successors, routes = np.asarray(lane_map.successors), lane_map.routes
@@ -171,7 +171,7 @@ def test_motion_of_free_egos_is_that_of_their_heading():
     np.testing.assert_allclose(found.v, v * np.cos([-0.05, 0.1, 0]), rtol=2e-3)
 
 
-def test_no_lane_gives_a_harmless_way():
+def test_no_lane_gives_a_path_of_finite_numbers():
     lane_map = bundled("highway")[1]
     nobody = jnp.array([NO_LANE])
     path = path_from(lane_map, nobody, jnp.zeros(1), jnp.zeros(1, jnp.int32), points=POINTS, step=STEP)

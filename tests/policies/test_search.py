@@ -1,4 +1,4 @@
-"""Decisions of groups: against enumeration, car following, mctx, and what social value orientation is for."""
+"""Decisions of groups: against enumeration and car following, and effects of social value orientation."""
 
 from dataclasses import replace
 from functools import partial
@@ -37,7 +37,7 @@ def test_default_policy_follows_by_idm(gap, v, v_lead):
     np.testing.assert_allclose(plan.s[0, 1], (v + plan.v[0, 1]) / 2 * SHORT.dt, rtol=1e-5)
 
 
-def test_actions_do_what_they_say():
+def test_actions_have_their_effects():
     scene = quality.road([(0, 10, 1), (300, 10, 1)], steps=STEPS)
     end = {}
     for action in range(5):
@@ -54,7 +54,7 @@ def test_actions_do_what_they_say():
     np.testing.assert_allclose(outer.y[0], 7, atol=1e-4)  # there is no lane
 
 
-def test_stops_before_what_stands_in_its_lane():
+def test_stops_before_an_obstacle_in_its_lane():
     stop = np.full((2, 3), NO_GAP)
     stop[0, 1] = 35
     scene = quality.road([(0, 10, 1), (300, 10, 1)], stop=stop, steps=STEPS)
@@ -65,7 +65,7 @@ def test_stops_before_what_stands_in_its_lane():
     assert not beside.crashed.any() and beside.s[0, -1] > 35
 
 
-def test_collisions_between_samples_and_whose_loss_it_is():
+def test_collisions_between_samples_and_their_loss():
     # 30 m/s faster: it is through the other one within a decision, and beside it at no end of a decision
     scene = quality.road([(0, 14, 0), (-26, 44, 0)], lanes=1, v0=44, steps=STEPS)
     scene = scene._replace(driver=replace(scene.driver, b_max=jnp.asarray([8.0, 1e-3]), b=jnp.full(2, 1e-3)))
@@ -194,7 +194,7 @@ def candidates(rows):
         ((4, 0, 10, 0, 0, 0), (0, 0, 10, 13, 16, 0), False),
     ],
 )
-def test_who_interacts(one, other, yes):
+def test_interactions(one, other, yes):
     found = np.asarray(interactions(candidates([one, other])))
     np.testing.assert_array_equal(found, [[False, yes], [yes, False]])
     off = candidates([one, other])._replace(active=jnp.asarray([True, False]))

@@ -1,4 +1,4 @@
-"""PDM-Hybrid: its inputs, its trajectory, its weights; and training on rollouts, by one call."""
+"""PDM-Hybrid: inputs, trajectory, weights, and training on rollouts."""
 
 import dataclasses
 import functools
@@ -133,7 +133,7 @@ def test_an_untrained_network_is_the_plan():
     np.testing.assert_array_equal(model.apply(weights, some.features), some.features.plan)
 
 
-def test_weights_that_are_none_are_named(tmp_path):
+def test_wrong_files_of_weights_are_named(tmp_path):
     assert learned.WEIGHTS.stat().st_size < 1e6
     with pytest.raises(ValueError, match=r"missing\.npz: no weights of PDM-Hybrid"):
         PDMHybrid(weights=str(tmp_path / "missing.npz"))
