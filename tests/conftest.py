@@ -22,7 +22,7 @@ from jaxtyping import install_import_hook  # noqa: E402
 # Shapes and types of these modules are checked in every call. Only modules of functions: the pytrees
 # that JAX rebuilds with placeholders inside would not pass.
 _hooked = ["limsim_jax.numerics", "limsim_jax.geometry"]
-_hooked += [f"limsim_jax.maps.{name}" for name in ("rasterise", "routing", "signals")]
+_hooked += [f"limsim_jax.maps.{name}" for name in ("outline", "rasterise", "routing", "signals")]
 _hooked += [f"limsim_jax.maps.conflicts.{name}" for name in ("build", "overlaps", "priority", "waiting")]
 install_import_hook(_hooked, "shape_checks.typecheck")
 

@@ -313,6 +313,29 @@ class _LaneGraph:
             allowed |= enters | stays | leaves
         return allowed
 
+    def _cost_to_go(
+        self,
+        ahead: NDArray[np.int_],
+        is_goal: NDArray[np.bool_],
+        change_penalty: float,
+        short_penalty: float,
+    ) -> Floats:
+        """Cost (m) of the best way from each lane to each goal."""
+        size, count = is_goal.shape
+        # Reversed links, and from every goal (a node of its own) to the ends of its lanes.
+        row, goal = np.nonzero(is_goal)
+        links = np.concatenate([ahead, self.left, self.right, np.column_stack([row, size + goal])])
+        # Where a lane is too short to change on, earlier is better.
+        room = self.length[np.concatenate([self.left, self.right])[:, 0]]
+        changes = max(change_penalty, 1e-6) + short_penalty * np.clip(1 - room / ROOM_TO_CHANGE, 0, 1)
+        if short_penalty:
+            changes += np.where(room < NO_ROOM, NO_WAY, 0)
+        costs = np.concatenate([self.cost[ahead[:, 0]], changes, self.cost[row]])
+        graph = _matrix(links[:, ::-1], np.maximum(costs, 1e-6), size + count)
+        if not count:
+            return np.full((size, count), np.inf)
+        return dijkstra(graph, indices=size + np.arange(count))[:, :size].T
+
     def solve(
         self,
         goals: Sequence[Sequence[int]],
@@ -321,41 +344,19 @@ class _LaneGraph:
         mask: NDArray[np.bool_] | None = None,
         short_penalty: float = SHORT_PENALTY,
     ) -> RouteTable:
-        """The tables, with one row more for the null lane. `mask` keeps some of the links ahead."""
+        """The tables of these goals, with the null lane last.
+
+        `goals` are groups of rows of lanes. `mask` keeps some of the links ahead.
+        """
         size, count = len(self.lanes), len(goals)
         ahead = self.ahead if mask is None else self.ahead[mask]
         is_goal = np.zeros((size, count), bool)
         for g, members in enumerate(goals):
             is_goal[[row for row in members if self.lanes[row].id in self.usable], g] = True
 
-        # Reversed links, and from every goal (a node of its own) to the ends of its lanes.
-        row, goal = np.nonzero(is_goal)
-        links = np.concatenate([ahead, self.left, self.right, np.column_stack([row, size + goal])])
-        # where a lane is too short to change on, earlier is better
-        room = self.length[np.concatenate([self.left, self.right])[:, 0]]
-        changes = max(change_penalty, 1e-6) + short_penalty * np.clip(1 - room / ROOM_TO_CHANGE, 0, 1)
-        if short_penalty:
-            changes += np.where(room < NO_ROOM, NO_WAY, 0)
-        costs = np.concatenate([self.cost[ahead[:, 0]], changes, self.cost[row]])
-        graph = _matrix(links[:, ::-1], np.maximum(costs, 1e-6), size + count)
-        cost = np.full((size, count), np.inf)
-        if count:
-            cost = dijkstra(graph, indices=size + np.arange(count))[:, :size].T
+        cost = self._cost_to_go(ahead, is_goal, change_penalty, short_penalty)
 
-        def best(pairs: NDArray[np.int_]) -> tuple[Floats, NDArray[np.int_]]:
-            """Least cost behind the links of each lane, and the lane there."""
-            least, which = np.full((size, count), np.inf), np.full((size, count), -1)
-            if not len(pairs):
-                return least, which
-            for n in range(int(np.bincount(pairs[:, 0]).max())):
-                nth = _nth_of_each(pairs, n)
-                tail, head = nth.T
-                better = cost[head] < least[tail]
-                which[tail] = np.where(better, head[:, None], which[tail])
-                least[tail] = np.where(better, cost[head], least[tail])
-            return least, which
-
-        behind, next_lane = best(ahead)
+        behind, next_lane = _best(ahead, cost)
         next_lane[is_goal] = -1
         own = self.cost[:, None]
         straight = np.where(is_goal, own, own + behind)
@@ -363,8 +364,8 @@ class _LaneGraph:
         # A vehicle stays in a lane where that costs almost nothing, half of the length of the lane at
         # most, so that the cost to go falls along the way.
         stays = straight <= cost + np.minimum(tolerance, 0.5 * own) + 1e-6
-        cost_left, to_left = best(self.left)
-        cost_right, to_right = best(self.right)
+        cost_left, to_left = _best(self.left, cost)
+        cost_right, to_right = _best(self.right, cost)
         reachable = np.isfinite(cost)
         changes_left = reachable & ~stays & (cost_left < cost_right)
         changes_right = reachable & ~stays & ~changes_left
@@ -380,16 +381,9 @@ class _LaneGraph:
             if (further == at).all():
                 break
             passed, at = passed + passed[at, columns], further
-        # Count the changes that follow each other on the lanes beside it.
-        aside, lane = np.zeros((size, count), int), itself
         step = np.where(changes_left, 1, np.where(changes_right, -1, 0))
         beside = np.where(changes_left, to_left, np.where(changes_right, to_right, itself))
-        direction = step
-        while True:
-            going_on = (step[lane, columns] == direction) & (direction != 0)
-            if not going_on.any():
-                break
-            aside, lane = aside + going_on * direction, np.where(going_on, beside[lane, columns], lane)
+        aside = _count_changes(step, beside)
         lanes_to_go = aside[at, columns]
         due = lanes_to_go != 0
         table = RouteTable(
@@ -401,6 +395,41 @@ class _LaneGraph:
             is_goal=is_goal,
         )
         return table.pad(lanes=size + 1, goals=count)
+
+
+def _best(pairs: NDArray[np.int_], cost: Floats) -> tuple[Floats, NDArray[np.int_]]:
+    """Least cost behind the links of each lane, and the lane there.
+
+    Both are `[lanes, goals]`. Lanes without a link have cost infinity and lane -1.
+    """
+    least, which = np.full(cost.shape, np.inf), np.full(cost.shape, -1)
+    if not len(pairs):
+        return least, which
+    for n in range(int(np.bincount(pairs[:, 0]).max())):
+        nth = _nth_of_each(pairs, n)
+        tail, head = nth.T
+        better = cost[head] < least[tail]
+        which[tail] = np.where(better, head[:, None], which[tail])
+        least[tail] = np.where(better, cost[head], least[tail])
+    return least, which
+
+
+def _count_changes(step: NDArray[np.int_], beside: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Consecutive lane changes from each lane, `[lanes, goals]`, left > 0.
+
+    Args:
+        step: the change on each lane: 1 left, -1 right, 0 none.
+        beside: the lane behind that change.
+    """
+    size, count = step.shape
+    columns = np.broadcast_to(np.arange(count), step.shape)
+    aside = np.zeros(step.shape, int)
+    lane = np.broadcast_to(np.arange(size)[:, None], step.shape)
+    while True:
+        continues = (step[lane, columns] == step) & (step != 0)
+        if not continues.any():
+            return aside
+        aside, lane = aside + continues * step, np.where(continues, beside[lane, columns], lane)
 
 
 def _matrix(links: NDArray[np.int_], costs: Floats, size: int) -> csr_array:

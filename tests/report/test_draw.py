@@ -34,7 +34,6 @@ from limsim_jax.maps.network import (
     TrafficLight,
     Turn,
 )
-from limsim_jax.maps.outline import union
 from limsim_jax.report.draw import TRAFFIC_ZORDER, draw_map, draw_network
 from limsim_jax.report.draw.painter import CENTRE, EDGE
 
@@ -340,10 +339,6 @@ def test_conflict_bands_lie_where_paths_cross(crossing):
         assert covered("#56b4e9", x, y) >= 2  # left and straight leave the same lane
         x, y = crossing.lanes[f"{arm}_out"].pose(0.0)[0][:2] * 0.98
         assert covered("#e69f00", x, y) >= 2
-
-
-def test_spans_are_joined_where_they_overlap():
-    assert union([(4.0, 5.0), (0.0, 2.0), (1.0, 3.0), (3.0, 3.5)]) == [(0.0, 3.5), (4.0, 5.0)]
 
 
 def test_speed_signs_show_their_number(crossing):

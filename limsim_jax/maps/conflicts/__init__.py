@@ -11,7 +11,7 @@ than the width of a vehicle and a margin. The package works once per map, on the
 
 from limsim_jax.maps.conflicts.build import build_conflicts
 from limsim_jax.maps.conflicts.overlaps import Overlap, connectors, find_overlaps
-from limsim_jax.maps.conflicts.priority import priority_cycles, ring_lanes
+from limsim_jax.maps.conflicts.priority import priority_cycles, roundabout_lanes
 from limsim_jax.maps.conflicts.table import ConflictTable, ConflictType
 
 __all__ = [
@@ -22,5 +22,5 @@ __all__ = [
     "connectors",
     "find_overlaps",
     "priority_cycles",
-    "ring_lanes",
+    "roundabout_lanes",
 ]

@@ -81,14 +81,13 @@ def connectors(network: Network) -> list[Lane]:
     return [lane for lane in lanes.values() if lane.junction is not None or lane.id in shared]
 
 
-def find_overlaps(network: Network, lanes: Sequence[Lane], width: float, margin: float) -> list[Overlap]:
+def find_overlaps(lanes: Sequence[Lane], width: float, margin: float) -> list[Overlap]:
     """All stretches on which two of these lanes come too close.
 
     Ends are exact to about 1 cm for paths that cross at more than 30 degrees. At flat angles the
     distance itself is exact to 5 mm.
 
     Args:
-        network: The map.
         lanes: The lanes to compare, see `connectors`.
         width: Width of vehicles, m.
         margin: Free space that they need between them, m.
@@ -113,7 +112,7 @@ def find_overlaps(network: Network, lanes: Sequence[Lane], width: float, margin:
         )
         for region, s in zip(regions, stretches.tolist(), strict=True)
     ]
-    found = _classify(network, lanes, overlaps)
+    found = _classify(lanes, overlaps)
     return [*found, *_merges_with_a_jump(lanes, found), *_sweeps(lanes, curves, overlaps, width)]
 
 
@@ -388,8 +387,8 @@ def _followers(lane: Lane, lanes: Mapping[str, Lane], reach: float) -> set[str]:
     return found - {lane.id}
 
 
-def _classify(network: Network, lanes: Sequence[Lane], overlaps: list[Overlap]) -> list[Overlap]:
-    """Tell crossing, merging and diverging stretches apart.
+def _classify(lanes: Sequence[Lane], overlaps: list[Overlap]) -> list[Overlap]:
+    """Find the kind of each stretch: crossing, merging or diverging.
 
     A stretch diverges if both lanes start there and come from the same lane. It merges if both end there
     and lead to the same lane, or end side by side too close for vehicles to pass. Lanes of one road that
@@ -458,26 +457,27 @@ def _classify(network: Network, lanes: Sequence[Lane], overlaps: list[Overlap]) 
                         kinds[m] = kind
                         todo.append(m)
 
-    def level(o: Overlap) -> Overlap:
-        """Begin or end the stretch level on both lanes.
-
-        Where one lane continues beside the other, its end is near a whole piece of that one. Vehicles
-        that follow each other through a merge or a split measure their gap from there.
-        """
-        i, j = lanes[o.first], lanes[o.second]
-        diverges = o.type is ConflictType.DIVERGE
-        links = "predecessors" if diverges else "successors"
-        if o.type is ConflictType.CROSS or set(getattr(i, links)) & set(getattr(j, links)):
-            return o
-        edge, s, f = (0, "s_in", "f_in") if diverges else (-1, "s_out", "f_out")
-        at_s = _closest(i, o.s_in, o.s_out, j.xyz[edge])
-        at_f = _closest(j, o.f_in, o.f_out, i.xyz[edge])
-        if abs(at_s - getattr(o, s)) > abs(at_f - getattr(o, f)):
-            return replace(o, **{s: at_s})
-        return replace(o, **{f: at_f})
-
     found = [replace(o, type=kind) for o, kind in zip(overlaps, kinds, strict=True)]
-    return [level(o) for o in found]
+    return [_level(lanes, o) for o in found]
+
+
+def _level(lanes: Sequence[Lane], o: Overlap) -> Overlap:
+    """Begin or end the stretch level on both lanes.
+
+    Where one lane continues beside the other, its end is near a whole piece of that one. Vehicles
+    that follow each other through a merge or a split measure their gap from there.
+    """
+    i, j = lanes[o.first], lanes[o.second]
+    diverges = o.type is ConflictType.DIVERGE
+    links = "predecessors" if diverges else "successors"
+    if o.type is ConflictType.CROSS or set(getattr(i, links)) & set(getattr(j, links)):
+        return o
+    edge, s, f = (0, "s_in", "f_in") if diverges else (-1, "s_out", "f_out")
+    at_s = _closest(i, o.s_in, o.s_out, j.xyz[edge])
+    at_f = _closest(j, o.f_in, o.f_out, i.xyz[edge])
+    if abs(at_s - getattr(o, s)) > abs(at_f - getattr(o, f)):
+        return replace(o, **{s: at_s})
+    return replace(o, **{f: at_f})
 
 
 def _closest(lane: Lane, start: float, end: float, point: Floats) -> float:

@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 class Rule(enum.IntEnum):
     """Rules of right of way, the weakest first.
 
-    Cycles are broken in this order, up to `RING`.
+    Cycles are broken in this order, up to `ROUNDABOUT`.
     """
 
     NONE = 0
@@ -33,7 +33,7 @@ class Rule(enum.IntEnum):
     ROAD = 2
     TURN = 3
     RAMP = 4
-    RING = 5
+    ROUNDABOUT = 5
     CONTROL = 6
     FILE = 7
 
@@ -98,8 +98,8 @@ class RightOfWay:
             if not movement.via:
                 self.direct[movement.incoming].append(movement)
         self.road_lanes = Counter(lane.carriageway for lane in network.drivable_lanes())
-        on_ring = ring_lanes(network, lanes)
-        self.from_ring = [bool(on_ring & {lane.id, *lane.predecessors}) for lane in lanes]
+        on_roundabout = roundabout_lanes(network, lanes)
+        self.from_roundabout = [bool(on_roundabout & {lane.id, *lane.predecessors}) for lane in lanes]
         self._paths: dict[int, list[Path]] = {}
 
     def only_movement(self, k: int) -> int:
@@ -169,7 +169,7 @@ class RightOfWay:
         opposing = abs(turned) > math.radians(120)
         comparisons = (
             (Rule.CONTROL, _CONTROL_RANK[one.control] - _CONTROL_RANK[two.control]),
-            (Rule.RING, self.from_ring[overlap.first] - self.from_ring[overlap.second]),
+            (Rule.ROUNDABOUT, self.from_roundabout[overlap.first] - self.from_roundabout[overlap.second]),
             (Rule.RAMP, (two.ramp - one.ramp) if merges else 0),
             (Rule.TURN, _turn_rank(one, opposing) - _turn_rank(two, opposing)),
             (Rule.ROAD, (one.size > two.size) - (one.size < two.size) if flat else 0),
@@ -202,7 +202,7 @@ def _turn_rank(path: Path, opposing: bool) -> int:
     return 2 if opposing and path.near_side else 1
 
 
-def ring_lanes(
+def roundabout_lanes(
     network: Network, lanes: Sequence[Lane], *, longest: float = 600.0, uneven: float = 0.35
 ) -> set[str]:
     """Ids of lanes on roundabouts that contain one of `lanes`.
@@ -288,7 +288,7 @@ def without_cycles(
     """
     prio = prio.copy()
     size = int(ends.max(initial=0)) + 1
-    for weakest in (Rule.SIDE, Rule.ROAD, Rule.TURN, Rule.RAMP, Rule.RING):
+    for weakest in (Rule.SIDE, Rule.ROAD, Rule.TURN, Rule.RAMP, Rule.ROUNDABOUT):
         yields = np.where(prio[:, None] < 0, ends, ends[:, ::-1])[prio != 0]
         group = connected_components(_graph(yields[:, 0], yields[:, 1], size), connection="strong")[1]
         prio[(rule == weakest) & (group[ends[:, 0]] == group[ends[:, 1]])] = 0

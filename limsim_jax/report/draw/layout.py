@@ -1,19 +1,91 @@
-"""Windows of a map on a page: strips of long thin maps, and details."""
+"""What a page with a map shows where: strips of long thin maps, and windows on details."""
 
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 
 import numpy as np
 
-from limsim_jax.maps.network import Array, Network
-from limsim_jax.maps.outline import Bounds, Outline
+from limsim_jax.maps.network import Array, MapError, Network
+from limsim_jax.maps.outline import Bounds, Outline, view
 
 GAP = 0.42
 """Space between strips for the ticks, inches."""
 
 CLEAR = 0.03
 """Scale at which a lane and its marks are easy to read, inches per metre."""
+
+LEGEND = 2.35
+"""Width of the legend, inches."""
+
+MARGINS = (0.75, 0.55, 0.95)
+"""Left, bottom and top of the page, inches."""
+
+_WIDTH, _HEIGHT = 14.0, 11.5  # inches, largest page without `size`
+
+Panel = tuple[Bounds, Bounds]
+"""Place on the page (x, y, width, height, inches) and the box that it shows (m)."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """Size (inches), scale (inches per metre) and panels of a page."""
+
+    size: tuple[float, float]
+    scale: float
+    strips: list[Panel]
+    stacked: bool  # strips lie below each other, otherwise side by side
+    details: list[Panel]
+
+
+def plan_page(
+    network: Network, shapes: dict[str, Outline], bounds: Bounds | None, size: tuple[float, float] | None
+) -> Page:
+    """Arrange a map on a page.
+
+    `size` is width and height in inches; without it the page fits the map. Windows on details lie below the
+    map if `size` and `bounds` are free and the scale is below `CLEAR`.
+
+    Raises `MapError` for `bounds` that are no rectangle or show no lane, and for a `size` without room for
+    the map.
+    """
+    window = view(network, shapes, bounds)
+    left, bottom, top = MARGINS
+    page = size or (_WIDTH, _HEIGHT)
+    room = (page[0] - left - LEGEND, page[1] - bottom - top)
+    if min(room) < 0.5:
+        raise MapError(f"size {page} inches leaves no room for the map", file=network.source)
+    parts, stacked, scale = strips(shapes, window, room)
+    wide, tall = parts[0][2] - parts[0][0], parts[0][3] - parts[0][1]
+    rows, columns = (len(parts), 1) if stacked else (1, len(parts))
+    details: list[Panel] = []
+    lower = 0.0  # inches, height of the windows below the map
+    if size is None:
+        used = rows * tall * scale + (rows - 1) * GAP, columns * wide * scale + (columns - 1) * GAP
+        room = (max(7.0, used[1]), max(2.8, used[0]))
+        if bounds is None and scale < CLEAR:
+            count = max(2, round(room[0] / 2.8))
+            side = (room[0] - (count - 1) * GAP) / count
+            details = [
+                ((left + i * (side + GAP), bottom, side, side), box)
+                for i, box in enumerate(detail_windows(network, shapes, count, 0.8 * side / scale))
+            ]
+            lower = side + bottom if details else 0.0
+        page = (room[0] + left + LEGEND, room[1] + bottom + top + lower)
+    cell = (room[0] - (columns - 1) * GAP) / columns, (room[1] - (rows - 1) * GAP) / rows
+    # Spare room of a strip shows its surroundings, but never its neighbours.
+    alone = len(parts) == 1
+    spare_x = max(0.0, cell[0] / scale - wide) / 2 if alone or not stacked else 0.0
+    spare_y = max(0.0, cell[1] / scale - tall) / 2 if alone or stacked else 0.0
+    panels: list[Panel] = []
+    for i, strip in enumerate(parts):
+        row, column = (i, 0) if stacked else (0, i)
+        x = left + column * (cell[0] + GAP)
+        y = lower + bottom + (rows - 1 - row) * (cell[1] + GAP)
+        box = (strip[0] - spare_x, strip[1] - spare_y, strip[2] + spare_x, strip[3] + spare_y)
+        panels.append(((x, y, *cell), box))
+    return Page(page, scale, panels, stacked, details)
 
 
 def strips(

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from limsim_jax.maps.network import Action, MapError, Network
-from limsim_jax.maps.outline import SURFACES, Bounds, conflict_zones, levels, outlines, view
-from limsim_jax.report.draw.layout import CLEAR, GAP, detail_windows, strips
+from limsim_jax.maps.outline import SURFACES, Bounds, conflict_zones, levels, outlines
+from limsim_jax.report.draw.layout import LEGEND, MARGINS, plan_page
 from limsim_jax.report.draw.painter import EDGE, INK, TRAFFIC_ZORDER, TURNS, Painter
 
 if TYPE_CHECKING:
@@ -18,11 +18,6 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".png", ".svg", ".pdf")
 """Kinds of file that `draw_map` writes."""
-
-# The page, in inches.
-_LEGEND = 2.35
-_MARGINS = (0.75, 0.55, 0.95)  # left, bottom, top
-_WIDTH, _HEIGHT = 14.0, 11.5  # largest page without `size`
 
 
 def draw_map(
@@ -69,38 +64,17 @@ def draw_map(
 
     shapes = outlines(network)
     storeys = levels(shapes.values())
-    window = view(network, shapes, bounds)
-    left, bottom, top = _MARGINS
-    page = size or (_WIDTH, _HEIGHT)
-    room = (page[0] - left - _LEGEND, page[1] - bottom - top)
-    if min(room) < 0.5:
-        raise MapError(f"size {page} inches leaves no room for the map", file=network.source)
-    parts, stacked, scale = strips(shapes, window, room)
-    wide, tall = parts[0][2] - parts[0][0], parts[0][3] - parts[0][1]
-    rows, columns = (len(parts), 1) if stacked else (1, len(parts))
-    details: list[Bounds] = []
-    detail = 0.0  # in, side of the windows below the map
-    if size is None:
-        used = rows * tall * scale + (rows - 1) * GAP, columns * wide * scale + (columns - 1) * GAP
-        room = (max(7.0, used[1]), max(2.8, used[0]))
-        if bounds is None and scale < CLEAR:
-            count = max(2, round(room[0] / 2.8))
-            detail = (room[0] - (count - 1) * GAP) / count
-            details = detail_windows(network, shapes, count, 0.8 * detail / scale)
-        lower = detail + bottom if details else 0.0
-        page = (room[0] + left + _LEGEND, room[1] + bottom + top + lower)
-    else:
-        lower = 0.0
-
-    figure = Figure(figsize=page, dpi=dpi, facecolor="white")
-    cell = (room[0] - (columns - 1) * GAP) / columns, (room[1] - (rows - 1) * GAP) / rows
+    page = plan_page(network, shapes, bounds, size)
+    figure = Figure(figsize=page.size, dpi=dpi, facecolor="white")
     legend: dict[str, dict[str, Any]] = {}
     zones = conflict_zones(network) if conflicts else None
 
     def panel(place: Bounds, box: Bounds, name: str) -> Axes:
         """Axes at x, y, width, height (inches) that show a box (m)."""
         x, y, width, height = place
-        ax = figure.add_axes((x / page[0], y / page[1], width / page[0], height / page[1]))
+        ax = figure.add_axes(
+            (x / page.size[0], y / page.size[1], width / page.size[0], height / page.size[1])
+        )
         painter = Painter(ax, network, shapes, storeys, box, name)
         painter.paint(zones=zones, labels=labels)
         legend.update(painter.legend)
@@ -113,31 +87,22 @@ def draw_map(
         return ax
 
     overview = []
-    for i, strip in enumerate(parts):
-        row, column = (i, 0) if stacked else (0, i)
-        # Spare room of a strip shows its surroundings, but never its neighbours.
-        alone = len(parts) == 1
-        spare_x = max(0.0, cell[0] / scale - wide) / 2 if alone or not stacked else 0.0
-        spare_y = max(0.0, cell[1] / scale - tall) / 2 if alone or stacked else 0.0
-        box = (strip[0] - spare_x, strip[1] - spare_y, strip[2] + spare_x, strip[3] + spare_y)
-        x = left + column * (cell[0] + GAP)
-        y = lower + bottom + (rows - 1 - row) * (cell[1] + GAP)
-        ax = panel((x, y, *cell), box, f"map{i}-")
-        if row == rows - 1:
+    for i, (place, box) in enumerate(page.strips):
+        ax = panel(place, box, f"map{i}-")
+        if not page.stacked or i == len(page.strips) - 1:
             ax.set_xlabel("x / m", fontsize=8, color=INK)
-        if column == 0:
+        if page.stacked or i == 0:
             ax.set_ylabel("y / m", fontsize=8, color=INK)
         overview.append(ax)
-    for i, detail_window in enumerate(details):
-        letter = "ABCDEFGH"[i]
-        ax = panel((left + i * (detail + GAP), bottom, detail, detail), detail_window, f"detail{letter}-")
+    for letter, (place, box) in zip("ABCDEFGH", page.details, strict=False):
+        ax = panel(place, box, f"detail{letter}-")
         ax.set_title(letter, fontsize=9, weight="bold", color=INK, loc="left", pad=3)
         for ax in overview:
-            _frame(ax, detail_window, letter)
+            _frame(ax, box, letter)
 
-    _title(figure, network, len(parts))
+    _title(figure, network, len(page.strips))
     _legend(figure, legend)
-    _scale_bar(figure, scale)
+    _scale_bar(figure, page.scale)
     if target is not None:
         _write(figure, target, dpi)
     return figure
@@ -210,7 +175,7 @@ def _title(figure: Figure, network: Network, strips: int) -> None:
         counts += f" · {strips} strips, one scale"
     totals = ", ".join(f"{network.report.total(action)} {action.value}" for action in Action)
     width, height = figure.get_size_inches()
-    x = _MARGINS[0] / width
+    x = MARGINS[0] / width
     file = Path(network.source).name
     name = network.name if network.name and network.name != file.split(".")[0] else ""
     figure.text(x, 1 - 0.30 / height, f"{file}   {name}".strip(), fontsize=13, weight="bold", color=INK)
@@ -266,7 +231,7 @@ def _legend(figure: Figure, entries: dict[str, dict[str, Any]]) -> None:
         handles,
         names,
         loc="upper left",
-        bbox_to_anchor=((width - _LEGEND + 0.1) / width, 1 - _MARGINS[2] / height + 0.02),
+        bbox_to_anchor=((width - LEGEND + 0.1) / width, 1 - MARGINS[2] / height + 0.02),
         frameon=False,
         fontsize=8,
         labelcolor=INK,
@@ -279,11 +244,11 @@ def _legend(figure: Figure, entries: dict[str, dict[str, Any]]) -> None:
 def _scale_bar(figure: Figure, scale: float) -> None:
     from matplotlib.lines import Line2D
 
-    most = (_LEGEND - 0.8) / scale  # m that fit above the legend
+    most = (LEGEND - 0.8) / scale  # m that fit above the legend
     unit = 10.0 ** math.floor(math.log10(most))
     metres = max(m for m in (unit, 2 * unit, 5 * unit) if m <= most)
     width, height = figure.get_size_inches()
-    x0 = width - _LEGEND + 0.15
+    x0 = width - LEGEND + 0.15
     x1, y = x0 + metres * scale, height - 0.62
     for xs, ys in (((x0, x1), (y, y)), ((x0, x0), (y, y + 0.07)), ((x1, x1), (y, y + 0.07))):
         bar = Line2D([x / width for x in xs], [v / height for v in ys], color=INK, lw=1.5)
