@@ -23,8 +23,8 @@ from scipy.stats import wasserstein_distance
 from limsim_jax.bench import _processor
 from limsim_jax.files import write_whole
 from limsim_jax.statistics import bootstrap
-from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import ExperimentFile, read_experiments
+from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.experiment import ExperimentFile, read_experiments
 from limsim_jax.xla import enable_compilation_cache, use_all_cores
 
 RESULTS = Path(__file__).parent / "results"

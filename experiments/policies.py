@@ -24,10 +24,10 @@ from readme_tables import PAPER, policies
 from limsim_jax.bench import bench_policy
 from limsim_jax.files import write_whole
 from limsim_jax.statistics import bootstrap, wilson
-from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import read_experiments
-from limsim_jax.sweep.runner import Progress, sweep
-from limsim_jax.sweep.store import open_results
+from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.experiment import read_experiments
+from limsim_jax.sweeps.runner import Progress, sweep
+from limsim_jax.sweeps.store import open_results
 from limsim_jax.xla import enable_compilation_cache, use_all_cores
 
 HERE = Path(__file__).parent

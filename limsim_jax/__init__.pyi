@@ -1,3 +1,12 @@
+from .api.env import Env as Env
+from .api.experiment import Ego as Ego
+from .api.experiment import Experiment as Experiment
+from .api.experiment import Flow as Flow
+from .api.experiment import load_experiments as load_experiments
+from .api.results import Results as Results
+from .api.results import open_results as open_results
+from .api.sweep import sweep as sweep
+from .api.world import World as World
 from .maps import bundled_maps as bundled_maps
 from .maps.lane_map import LaneMap as LaneMap
 from .maps.lane_map import pose as pose
@@ -6,9 +15,34 @@ from .maps.map import Map as Map
 from .maps.map import load_map as load_map
 from .maps.network import MapError as MapError
 from .maps.network import Network as Network
+from .policies.area import AreaOfInterest as AreaOfInterest
+from .policies.base import LikeTraffic as LikeTraffic
+from .policies.base import Policy as Policy
+from .policies.host import HostPolicy as HostPolicy
+from .policies.host import Observation as Observation
+from .policies.limsim_tm import LimSimTM as LimSimTM
+from .policies.pdm import PDMClosed as PDMClosed
+from .policies.pdm import PDMHybrid as PDMHybrid
+from .policies.reference import reference_path as reference_path
+from .policies.reference import to_cartesian as to_cartesian
+from .policies.simple import ConstantSpeed as ConstantSpeed
+from .policies.simple import FollowLane as FollowLane
+from .simulation.checkpoint import fork as fork
 from .simulation.rollout import Rollout as Rollout
 from .simulation.worlds import Worlds as Worlds
+from .sweeps.experiment import ExperimentError as ExperimentError
+from .sweeps.experiment import bundled_experiments as bundled_experiments
+from .sweeps.store import ResultsError as ResultsError
+from .traffic.car_following import ACC as ACC
+from .traffic.car_following import IDM as IDM
+from .traffic.car_following import IIDM as IIDM
+from .traffic.ego import Control as Control
+from .traffic.ego import Trajectory as Trajectory
+from .traffic.engine import Command as Command
 from .traffic.engine import Traffic as Traffic
+from .traffic.vehicles import Population as Population
+from .traffic.vehicles import default_population as default_population
 from .types import Config as Config
+from .types import State as State
 
 __version__: str

@@ -499,8 +499,8 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
 
     from limsim_jax.simulation.rollout import started
     from limsim_jax.simulation.worlds import over_worlds
-    from limsim_jax.sweep.episode import Episodes
-    from limsim_jax.sweep.experiment import read_experiments
+    from limsim_jax.sweeps.episode import Episodes
+    from limsim_jax.sweeps.experiment import read_experiments
     from limsim_jax.xla import enable_compilation_cache, run_once, use_all_cores
 
     options = json.loads(told)

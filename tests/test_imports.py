@@ -26,9 +26,10 @@ ORDER = [
     {"policies"},
     {"simulation"},
     {"metrics"},
-    {"sweep", "calibration", "log_replay"},
+    {"sweeps", "calibration", "log_replay"},
     {"training"},
     {"report", "bridges"},
+    {"api"},
     {"bench"},
     {"cli"},
 ]

@@ -124,7 +124,7 @@ def _home(package: ModuleType, name: str) -> str:
 
 def experiment() -> str:
     """Every field of an experiment file."""
-    module = importlib.import_module("limsim_jax.sweep.experiment")
+    module = importlib.import_module("limsim_jax.sweeps.experiment")
     text = [
         "# Experiment file",
         "",
@@ -165,7 +165,7 @@ def experiment() -> str:
 
 
 def _bundled(name: str) -> list[str]:
-    from limsim_jax.sweep.experiment import bundled_experiments
+    from limsim_jax.sweeps.experiment import bundled_experiments
 
     return bundled_experiments()[name].read_text(encoding="utf-8").rstrip().split("\n")
 

@@ -296,7 +296,7 @@ def run(
         _write_json(json_file, summary)
     _show(f"{Path(network.source).name}, {summary['seconds']:g} s, seed {seed}", arrivals, summary)
     if trace_file is not None:
-        from limsim_jax.cli.trace import write_trace
+        from limsim_jax.simulation.table import write_trace
 
         write_trace(trace_file, network, lane_map, result.trace)
     if picture is not None or video is not None:
@@ -359,8 +359,8 @@ def policy(
 ) -> None:
     """Time the decisions of a policy: of one world on one core, and of many on all."""
     from limsim_jax.bench import bench_policy, policy_lines
-    from limsim_jax.sweep.episode import Episodes
-    from limsim_jax.sweep.experiment import read_experiments
+    from limsim_jax.sweeps.episode import Episodes
+    from limsim_jax.sweeps.experiment import read_experiments
 
     check_writable(json_file)
     read = read_experiments(experiment, policy=name)

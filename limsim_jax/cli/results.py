@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,10 +16,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from limsim_jax.report.tables import TextTable
-    from limsim_jax.sweep.episode import Episodes
-    from limsim_jax.sweep.experiment import ExperimentFile
-    from limsim_jax.sweep.runner import Progress
-    from limsim_jax.sweep.store import Results
+    from limsim_jax.sweeps.episode import Episodes
+    from limsim_jax.sweeps.experiment import ExperimentFile
+    from limsim_jax.sweeps.store import Results
 
 ExperimentArgument = Annotated[
     str,
@@ -80,7 +78,7 @@ def sweep(
     html: Annotated[bool, typer.Option("--report/--no-report", help="Write the report at the end.")] = True,
 ) -> None:
     """Run an experiment with many seeds; go on where an earlier run has stopped."""
-    from limsim_jax.sweep.experiment import read_experiments
+    from limsim_jax.sweeps.experiment import read_experiments
 
     part, stop = _shard(shard), _until(until_ci)
     if seeds < 1:
@@ -93,11 +91,12 @@ def sweep(
     folder = Path("results") / Path(experiment).stem if out is None else out
     begin = time.perf_counter()
 
-    from limsim_jax.sweep import runner
+    from limsim_jax.api.progress import progress_bar
+    from limsim_jax.sweeps import runner
 
-    with _bar() as show:
+    with progress_bar() as show:
         if workers is not None:
-            from limsim_jax.sweep.cluster import sweep_on_ray
+            from limsim_jax.sweeps.cluster import sweep_on_ray
 
             factory = functools.partial(build, experiments, chunk, cores=1)
             summary = sweep_on_ray(
@@ -159,7 +158,7 @@ def compare(
     """Compare B with A seed by seed: equal seeds are equal traffic."""
     from limsim_jax.report.compare import compare as compare_results
     from limsim_jax.report.compare import comparison_text
-    from limsim_jax.sweep.store import open_results
+    from limsim_jax.sweeps.store import open_results
 
     pair: tuple[str, str] | None = None
     if policies is not None:
@@ -183,12 +182,13 @@ def verify(
     seed: Annotated[int, typer.Option(help="Of the choice.")] = 0,
 ) -> None:
     """Run a random sample of stored worlds again, and compare every number and the final state."""
-    from limsim_jax.sweep.runner import verify as verify_results
-    from limsim_jax.sweep.store import open_results
+    from limsim_jax.api.results import rebuild
+    from limsim_jax.sweeps.runner import verify as verify_results
+    from limsim_jax.sweeps.store import open_results
 
     opened = open_results(results)
     groups = list(opened.provenance)
-    found = verify_results(opened, [_rebuild(opened, *group) for group in groups], sample, seed)
+    found = verify_results(opened, [rebuild(opened, *group) for group in groups], sample, seed)
     for line in found.differences:
         print(f"made differently: {line}")
     for miss in found.mismatches:
@@ -213,7 +213,8 @@ def replay(
     ] = None,
 ) -> None:
     """Run one world of the results again and show it."""
-    from limsim_jax.sweep.store import open_results
+    from limsim_jax.api.results import rebuild
+    from limsim_jax.sweeps.store import open_results
 
     opened = open_results(results)
     group = _group(opened, scenario, policy)
@@ -228,7 +229,7 @@ def replay(
     if stored is None:
         print(f"note: the results hold no seed {seed} of {group[0]} ({group[1]}); it is run now")
     path.parent.mkdir(parents=True, exist_ok=True)
-    network, lane_map, trace, ego, moments, metrics = _rebuild(opened, *group).replay(seed)
+    network, lane_map, trace, ego, moments, metrics = rebuild(opened, *group).replay(seed)
     for row in moments:
         value = "" if math.isnan(row["value"]) else f", {row['value']:.2f}"
         who = f", responsible: {row['responsible']}" if row["responsible"] else ""
@@ -254,7 +255,7 @@ def replay(
 
             write_picture(path, network, lane_map, trace, egos=[ego])
         case _:
-            from limsim_jax.cli.trace import write_trace
+            from limsim_jax.simulation.table import write_trace
 
             write_trace(path, network, lane_map, trace)
     print(f"wrote {path}")
@@ -267,22 +268,11 @@ def build(
     experiments: Sequence[ExperimentFile], chunk: int | None = None, cores: int | None = None
 ) -> list[Episodes]:
     """Episodes of experiments, on all cores or so many."""
-    from limsim_jax.sweep.episode import Episodes
+    from limsim_jax.sweeps.episode import Episodes
     from limsim_jax.xla import use_all_cores
 
-    with contextlib.suppress(RuntimeError):  # the backend runs already
-        use_all_cores(cores)
+    use_all_cores(cores)
     return [Episodes(one, chunk=chunk) for one in experiments]
-
-
-def _rebuild(results: Results, scenario: str, policy: str) -> Episodes:
-    """Episodes as they were when the results were made."""
-    from limsim_jax.sweep.experiment import ExperimentFile
-
-    stored = results.provenance[scenario, policy]
-    experiment = ExperimentFile.model_validate(stored["experiment"] | {"map": stored["map_file"]})
-    (episodes,) = build([experiment], stored["chunk"])
-    return episodes
 
 
 def _group(results: Results, scenario: str | None, policy: str | None) -> tuple[str, str]:
@@ -332,43 +322,10 @@ def _until(text: str | None) -> tuple[float, str] | None:
         raise typer.BadParameter(f"'{text}'; as 0.02 or 0.5:mean_speed", param_hint="--until-ci") from None
 
 
-@contextlib.contextmanager
-def _bar() -> Iterator[Callable[[Progress], None]]:
-    """A progress bar; without a terminal a line when a scenario is finished."""
-    from rich import progress as rich_progress
-    from rich.console import Console
-
-    console = Console()
-    with rich_progress.Progress(
-        rich_progress.TextColumn("{task.description:<28}"),
-        rich_progress.BarColumn(bar_width=24),
-        rich_progress.TextColumn("{task.completed:.0f}/{task.total:.0f} worlds  {task.fields[said]}"),
-        console=console,
-        disable=not console.is_terminal,
-    ) as bar:
-        tasks: dict[tuple[str, str], Any] = {}
-
-        def show(now: Progress) -> None:
-            key = now.scenario, now.policy
-            if key not in tasks:
-                tasks[key] = bar.add_task(f"{now.scenario} / {now.policy}", total=now.wanted, said="")
-            said = f"{now.km:,.0f} km  {now.contacts:.0f} contacts"
-            if now.stage == "compiling":
-                said = "compiling"
-            elif not math.isnan(now.eta) and now.stage == "running":
-                said += f"  {now.eta:.0f} s left"
-            bar.update(tasks[key], completed=now.done, said=said)
-            if now.stage == "finished" and not console.is_terminal:
-                print(f"{now.scenario} / {now.policy}: {now.done} of {now.wanted} worlds, {said}, "
-                      f"{now.elapsed:.0f} s", flush=True)  # fmt: skip
-
-        yield show
-
-
 def _print_headline(path: Path) -> tuple[Results, pa.Table]:
     """Print it; the results and their summary."""
     from limsim_jax.report.tables import headline, summary
-    from limsim_jax.sweep.store import open_results
+    from limsim_jax.sweeps.store import open_results
 
     results = open_results(path)
     table = summary(results)
@@ -401,11 +358,12 @@ def _print_table(table: TextTable) -> None:
 
 
 def _write_report(results: Results, table: pa.Table, path: Path, worst: int) -> None:
+    from limsim_jax.api.results import rebuild
     from limsim_jax.report.page import write_report
 
     @functools.cache
     def episodes(scenario: str, policy: str) -> Episodes:
-        return _rebuild(results, scenario, policy)
+        return rebuild(results, scenario, policy)
 
     def again(scenario: str, policy: str, seed: int) -> tuple[Any, ...]:
         return episodes(scenario, policy).replay(seed)

@@ -186,6 +186,34 @@ def _empty_road(seen: Any) -> Any:
     )
 
 
+def command_from(kind: Kind, found: Mapping[str, Any], config: Config, state: State, dt: float) -> Command:
+    """The command of arrays by name, as a host function or an environment's caller gives them.
+
+    Args:
+      kind: what they are.
+      found: see `HostPolicy`, without the axis of worlds; trajectories in the frames of the egos.
+      config: of the run.
+      state: in which the command is given.
+      dt: s between samples of trajectories.
+    """
+    if kind == "control":
+        return Command(control=Control(**{name: jnp.asarray(x, jnp.float32) for name, x in found.items()}))
+    if kind == "meta":
+        return Command(meta=jnp.asarray(found["meta"], jnp.int32))
+    egos = state.egos
+    x, y, heading, v = (jnp.asarray(found[name], jnp.float32) for name in ("x", "y", "heading", "v"))
+    cos, sin = jnp.cos(egos.heading)[:, None], jnp.sin(egos.heading)[:, None]
+    trajectory = Trajectory(
+        x=egos.x[:, None] + cos * x - sin * y,
+        y=egos.y[:, None] + sin * x + cos * y,
+        heading=wrap_angle(egos.heading[:, None] + heading),
+        v=v,
+        t0=config.time(state.step),
+        dt=dt,
+    )
+    return Command(trajectory=trajectory)
+
+
 @dataclass(frozen=True)
 class HostPolicy(Policy):
     """Egos driven by a function on the host.
@@ -258,8 +286,8 @@ class HostPolicy(Policy):
     ) -> tuple[Command, Any]:
         """Call the function."""
         del key
-        egos, seen = state.egos, self.observe(config, lane_map, state)
-        count = egos.slot.shape[0]
+        seen = self.observe(config, lane_map, state)
+        count = state.egos.slot.shape[0]
         shapes = {name: (count, *rest) for name, rest in self._fields().items()}
 
         def ask(one: Any, seen: Any, memory: Any) -> Any:
@@ -278,20 +306,7 @@ class HostPolicy(Policy):
         found, memory = jax.pure_callback(
             ask, (wanted, kept), jnp.zeros(()), seen, memory, vmap_method="broadcast_all"
         )
-        if self.command == "control":
-            return Command(control=Control(**found)), memory
-        if self.command == "meta":
-            return Command(meta=found["meta"]), memory
-        cos, sin = jnp.cos(egos.heading)[:, None], jnp.sin(egos.heading)[:, None]
-        trajectory = Trajectory(
-            x=egos.x[:, None] + cos * found["x"] - sin * found["y"],
-            y=egos.y[:, None] + sin * found["x"] + cos * found["y"],
-            heading=wrap_angle(egos.heading[:, None] + found["heading"]),
-            v=found["v"],
-            t0=config.time(state.step),
-            dt=self.dt,
-        )
-        return Command(trajectory=trajectory), memory
+        return command_from(self.command, found, config, state, self.dt), memory
 
     def _fields(self) -> dict[str, tuple[int, ...]]:
         """Names of the returned arrays, and their axes after `[B, E]`."""

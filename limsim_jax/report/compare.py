@@ -29,7 +29,7 @@ from limsim_jax.report.tables import (
 from limsim_jax.statistics import check_level, holm, mcnemar, mean_intervals, paired_t
 
 if TYPE_CHECKING:
-    from limsim_jax.sweep.store import Results
+    from limsim_jax.sweeps.store import Results
 
 _UNDER_TEST = {"name", "description", "ego.policy", "ego.options", "ego.driver"}
 _VERSION = ("version", "source", "platform", "machine", "jax", "jaxlib")

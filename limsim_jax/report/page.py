@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from limsim_jax.maps.lane_map import LaneMap
     from limsim_jax.maps.network import Network
     from limsim_jax.simulation.trace import Trace
-    from limsim_jax.sweep.store import Results
+    from limsim_jax.sweeps.store import Results
 
 Replayer = Callable[[str, str, int], tuple[Any, ...]]
 """(scenario, policy, seed) -> (network, lane_map, trace, slot of the ego, moments, ...)."""

@@ -30,7 +30,7 @@ from limsim_jax.statistics import (
 )
 
 if TYPE_CHECKING:
-    from limsim_jax.sweep.store import Results
+    from limsim_jax.sweeps.store import Results
 
 Floats = NDArray[np.float64]
 Kind = Literal["proportion", "mean", "label", "rate"]

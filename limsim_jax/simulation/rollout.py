@@ -167,6 +167,10 @@ def world_key(seed: int | Int[Array, ""]) -> Key[Array, ""]:
     return jax.random.fold_in(jax.random.key(0), seed)
 
 
+Sampler = Callable[[Key[Array, ""]], Scenario]
+"""Draws the scenario of a world from its key."""
+
+
 class Started(NamedTuple):
     """A world before its first decision, and all that `Rollout.advance` needs beside the map."""
 
@@ -175,17 +179,13 @@ class Started(NamedTuple):
     carry: Carry
 
 
-def started(
-    run: Rollout, lane_map: LaneMap, sampler: Callable[[Key[Array, ""]], Scenario], seed: int | Int[Array, ""]
-) -> Started:
+def started(run: Rollout, lane_map: LaneMap, sampler: Sampler, seed: int | Int[Array, ""]) -> Started:
     """Draw the scenario of a seed and put it on the map."""
     scenario_key, policy_key = jax.random.split(world_key(seed))
     scenario = sampler(scenario_key)
     return Started(scenario.schedule, policy_key, run.init(lane_map, scenario.start))
 
 
-def one_world(
-    run: Rollout, lane_map: LaneMap, sampler: Callable[[Key[Array, ""]], Scenario], seed: int | Int[Array, ""]
-) -> Result:
+def one_world(run: Rollout, lane_map: LaneMap, sampler: Sampler, seed: int | Int[Array, ""]) -> Result:
     """The world of a seed from start to end; the same whether it runs alone or in a batch."""
     return run.advance(lane_map, *started(run, lane_map, sampler, seed))[0]

@@ -22,8 +22,8 @@ from limsim_jax.calibration.population import (
 from limsim_jax.calibration.report import calibrate
 from limsim_jax.calibration.synthetic import TYPICAL, follow
 from limsim_jax.recordings import RecordingError
-from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import ExperimentError, read_experiments
+from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.experiment import ExperimentError, read_experiments
 from limsim_jax.traffic.population_file import read_population
 from limsim_jax.traffic.vehicles import default_population, sample_vehicles
 

@@ -17,8 +17,8 @@ from limsim_jax.policies import host
 from limsim_jax.policies.host import HostPolicy, Observe
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.worlds import Worlds
-from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import ExperimentFile
+from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.experiment import ExperimentFile
 from limsim_jax.traffic.ego import Meta, from_lane
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes

@@ -16,7 +16,7 @@ from fake_traces import small_trace
 
 from limsim_jax.report import page, tables
 from limsim_jax.report.page import write_report
-from limsim_jax.sweep.store import Results
+from limsim_jax.sweeps.store import Results
 
 GROUP = ("highway", "like_traffic")
 

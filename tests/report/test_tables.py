@@ -11,7 +11,7 @@ from pyarrow.csv import read_csv
 from limsim_jax.report import tables
 from limsim_jax.report.tables import headline, lookup, summary, worst, write_csv
 from limsim_jax.statistics import bootstrap, wilson
-from limsim_jax.sweep.store import Results
+from limsim_jax.sweeps.store import Results
 
 
 def rows_of(results: Results, **kwargs: Any) -> dict[str, dict[str, Any]]:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from traffic_worlds import bundled
 
-from limsim_jax.cli.trace import write_trace
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES
 from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import default_goals
@@ -18,6 +17,7 @@ from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.simulation.checkpoint import fork, load, save
 from limsim_jax.simulation.rollout import Rollout, world_key
+from limsim_jax.simulation.table import write_trace
 from limsim_jax.simulation.totals import count
 from limsim_jax.simulation.trace import trace
 from limsim_jax.simulation.worlds import Worlds

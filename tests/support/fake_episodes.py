@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from limsim_jax.sweep.runner import sweep
-from limsim_jax.sweep.store import Outcome
+from limsim_jax.sweeps.runner import sweep
+from limsim_jax.sweeps.store import Outcome
 
 
 @dataclass

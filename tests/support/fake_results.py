@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from limsim_jax.metrics import ego
 from limsim_jax.metrics.blame import Responsibility
-from limsim_jax.sweep.store import MOMENTS, Results
+from limsim_jax.sweeps.store import MOMENTS, Results
 
 UNITS = ego.NAMES | {"traffic_collided": "vehicles that touched another", "traffic_mean_speed": "m/s"}
 NAN = float("nan")

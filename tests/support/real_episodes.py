@@ -3,8 +3,8 @@
 import os
 from pathlib import Path
 
-from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import ExperimentFile
+from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.experiment import ExperimentFile
 
 
 class Noted(Episodes):

@@ -10,8 +10,8 @@ from limsim_jax.maps.lane_map import NO_LANE
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.metrics.safety import encounter, overlaps
 from limsim_jax.policies.simple import ConstantSpeed, FollowLane
-from limsim_jax.sweep.episode import Episodes, _moments, _succeeds
-from limsim_jax.sweep.experiment import Bounds, ExperimentFile
+from limsim_jax.sweeps.episode import Episodes, _moments, _succeeds
+from limsim_jax.sweeps.experiment import Bounds, ExperimentFile
 
 SEEDS = (0, 3, 5)
 SLOTS = 32

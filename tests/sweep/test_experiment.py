@@ -7,8 +7,8 @@ from paths import REPO
 from traffic_worlds import bundled
 
 from limsim_jax.maps.lane_map import lane_ids
-from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import ExperimentError, bundled_experiments, read_experiments
+from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.experiment import ExperimentError, bundled_experiments, read_experiments
 
 GOOD = """
 map = "intersection"

@@ -14,10 +14,10 @@ from real_episodes import noted
 
 ray = pytest.importorskip("ray", reason="needs the extra 'ray'")
 
-from limsim_jax.sweep import cluster  # noqa: E402
-from limsim_jax.sweep.cluster import sweep_on_ray  # noqa: E402
-from limsim_jax.sweep.runner import Progress, sweep  # noqa: E402
-from limsim_jax.sweep.store import open_results  # noqa: E402
+from limsim_jax.sweeps import cluster  # noqa: E402
+from limsim_jax.sweeps.cluster import sweep_on_ray  # noqa: E402
+from limsim_jax.sweeps.runner import Progress, sweep  # noqa: E402
+from limsim_jax.sweeps.store import open_results  # noqa: E402
 
 
 @pytest.fixture(scope="module", autouse=True)

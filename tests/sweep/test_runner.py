@@ -19,9 +19,9 @@ from paths import REPO
 
 from limsim_jax import files
 from limsim_jax.statistics import bootstrap, wilson
-from limsim_jax.sweep import runner
-from limsim_jax.sweep.runner import Progress, run_here, sweep, verify
-from limsim_jax.sweep.store import Results, ResultsError, open_results
+from limsim_jax.sweeps import runner
+from limsim_jax.sweeps.runner import Progress, run_here, sweep, verify
+from limsim_jax.sweeps.store import Results, ResultsError, open_results
 
 FAKE = [sys.executable, "-B", str(REPO / "tests" / "support" / "fake_episodes.py")]
 
@@ -529,7 +529,7 @@ def test_memory_does_not_grow_with_the_seeds(tmp_path):
 import resource, sys
 sys.path[:0] = sys.argv[3:]
 from fake_episodes import FakeEpisodes
-from limsim_jax.sweep.runner import sweep
+from limsim_jax.sweeps.runner import sweep
 fake = FakeEpisodes(chunk=64, columns=60)
 for seeds in (640, int(sys.argv[1])):
     sweep([fake], range(seeds), sys.argv[2], until_ci=(0.0001, "success"))

@@ -15,8 +15,8 @@ from fake_episodes import FakeEpisodes, both
 from paths import REPO
 
 from limsim_jax import files
-from limsim_jax.sweep import store
-from limsim_jax.sweep.store import DamagedError, Entry, Outcome, ResultsError, Shards, open_results, register
+from limsim_jax.sweeps import store
+from limsim_jax.sweeps.store import DamagedError, Entry, Outcome, ResultsError, Shards, open_results, register
 
 
 def entry(fake: FakeEpisodes) -> Entry:
@@ -280,7 +280,7 @@ def test_a_file_that_hits_a_limit_leaves_no_part_behind(tmp_path):
     done = python(f"""
 import resource
 from fake_episodes import FakeEpisodes
-from limsim_jax.sweep.runner import sweep
+from limsim_jax.sweeps.runner import sweep
 resource.setrlimit(resource.RLIMIT_FSIZE, (7000, 7000))
 try:
     sweep([FakeEpisodes(chunk=64, columns=80)], range(64), {str(tmp_path / "new")!r})
@@ -304,7 +304,7 @@ def test_an_unwritable_folder_is_one_line_before_anything_runs(tmp_path):
     done = python(f"""
 import os
 from fake_episodes import FakeEpisodes
-from limsim_jax.sweep.runner import sweep
+from limsim_jax.sweeps.runner import sweep
 if os.geteuid() == 0:  # to whom nothing is forbidden
     os.seteuid(65534)
 fake = FakeEpisodes()

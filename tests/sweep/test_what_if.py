@@ -10,9 +10,9 @@ import pytest
 from limsim_jax.policies.simple import ConstantSpeed
 from limsim_jax.simulation.checkpoint import fork
 from limsim_jax.simulation.rollout import one_world
-from limsim_jax.sweep.episode import Episodes
-from limsim_jax.sweep.experiment import EgoTable, ExperimentFile, TrafficTable
-from limsim_jax.sweep.what_if import stopped
+from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.experiment import EgoTable, ExperimentFile, TrafficTable
+from limsim_jax.sweeps.what_if import stopped
 
 SEED = 3
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Key
 
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.simulation.rollout import Carry, Rollout, Started, started
-from limsim_jax.sweep.episode import Episodes
+from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.types import Schedule
 from limsim_jax.xla import enable_compilation_cache, run_once
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from limsim_jax.sweep.runner import Episodes, Progress, SweepSummary, sweep
-from limsim_jax.sweep.store import Entry, Outcome
+from limsim_jax.sweeps.runner import Episodes, Progress, SweepSummary, sweep
+from limsim_jax.sweeps.store import Entry, Outcome
 
 RETRIES = 3
 """Times that a chunk is given to another worker before the sweep gives up."""

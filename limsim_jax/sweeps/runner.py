@@ -29,7 +29,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from limsim_jax.statistics import Interval, bootstrap, wilson
-from limsim_jax.sweep.store import (
+from limsim_jax.sweeps.store import (
     NOT_COMPARED,
     DamagedError,
     Entry,
@@ -204,7 +204,8 @@ def _missing(shards: Shards, seeds: list[int], tell: _Teller, damaged: list[str]
         found = chunk.episodes.column("seed").to_pylist()
         missing.difference_update(found)
         mine = np.array([seed in wanted for seed in found], bool)
-        tell.count(int(mine.sum()), {name: chunk.column(name)[mine] for name in _Teller.SUMS})
+        worlds = len({seed for seed in found if seed in wanted})
+        tell.count(worlds, {name: chunk.column(name)[mine] for name in _Teller.SUMS})
     return missing
 
 
@@ -236,8 +237,9 @@ def _sweep_one(
         for outcome in run_chunks(episodes, chunks):
             shards.write(outcome)
             due.difference_update(outcome.seeds.tolist())
-            ran += len(outcome.seeds)
-            tell.count(len(outcome.seeds), outcome.metrics, fresh=True)
+            worlds = len(np.unique(outcome.seeds))
+            ran += worlds
+            tell.count(worlds, outcome.metrics, fresh=True)
             tell("running")
         if due:
             raise RuntimeError(f"{shards.entry.label}: seed {min(due)} was asked for and never came back")
@@ -279,6 +281,8 @@ class _Teller:
         km, metres, contacts = (
             float(np.nansum(metrics[name])) if name in metrics else 0.0 for name in self.SUMS
         )
+        if self.SUMS[0] in metrics and np.size(metrics[self.SUMS[0]]):
+            km *= worlds / np.size(metrics[self.SUMS[0]])  # each ego of a world has a row with that number
         self.done += worlds
         self.fresh += worlds if fresh else 0
         self.km += km or metres / 1000
@@ -323,6 +327,7 @@ def _interval(values: Sequence[float], share: bool, level: float) -> Interval:
     x = x[np.isfinite(x)]
     if x.size < 2:
         return Interval(math.nan, -math.inf, math.inf)
+    share = share and bool(np.isin(x, (0.0, 1.0)).all())  # a mean over several egos is no share
     return wilson(int(np.sum(x > 0.5)), x.size, level) if share else bootstrap(x, level=level)
 
 
@@ -437,8 +442,13 @@ def verify(results: Results, episodes: Sequence[Episodes], sample: int = 16, see
         one.compile()
         for first in range(0, rows.size, one.chunk):
             some = results.episodes.take(rows[first : first + one.chunk])
-            outcome = one.run(some.column("seed").to_pylist())
-            for i, row in enumerate(some.to_pylist()):
+            outcome = one.run(list(dict.fromkeys(some.column("seed").to_pylist())))
+            places = {
+                pair: i
+                for i, pair in enumerate(zip(outcome.seeds.tolist(), outcome.egos.tolist(), strict=True))
+            }
+            for row in some.to_pylist():
+                i = places[row["seed"], row["ego"]]
                 what = ["digest"] * (row["digest"] != int(outcome.digest[i]))
                 for name, values in outcome.metrics.items():
                     value = None if np.isnan(values[i]) else float(values[i])

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.files import write_whole
 
-FORMAT = 1
+FORMAT = 2
 """Version of the layout of a results directory."""
 
 NOT_COMPARED = frozenset({"device", "map_file", "memory", "python"})
@@ -45,6 +45,7 @@ MOMENTS = pa.schema(
         ("scenario", pa.string()),
         ("policy", pa.string()),
         ("seed", pa.int64()),
+        ("ego", pa.int32()),  # number of the ego in its world
         ("rank", pa.int32()),  # 1: the worst of its episode
         ("kind", pa.string()),
         ("time", pa.float64()),  # s
@@ -59,7 +60,13 @@ MOMENTS = pa.schema(
 """Columns of the table of key moments; from `other` on they may be null."""
 
 KEYS = pa.schema(
-    [("scenario", pa.string()), ("policy", pa.string()), ("seed", pa.int64()), ("digest", pa.uint64())]
+    [
+        ("scenario", pa.string()),
+        ("policy", pa.string()),
+        ("seed", pa.int64()),
+        ("ego", pa.int32()),  # number of the ego in its world; 0 in a world without one
+        ("digest", pa.uint64()),  # of the world
+    ]
 )
 """First columns of the table of episodes; every metric follows as float64, null where not measured."""
 
@@ -80,13 +87,14 @@ class DamagedError(ResultsError):
 
 
 class Outcome(NamedTuple):
-    """What became of `W` worlds, with `M` key moments."""
+    """How worlds ended: `R` rows, one per world and ego, and `M` key moments."""
 
-    seeds: NDArray[np.int64]  # [W]
-    metrics: Mapping[str, NDArray[np.float64]]  # [W] each; NaN: not measured
+    seeds: NDArray[np.int64]  # [R], a row per world and ego
+    egos: NDArray[np.int32]  # [R], number of the ego
+    metrics: Mapping[str, NDArray[np.float64]]  # [R] each; NaN: not measured
     moments: Mapping[str, NDArray[Any]]
     """Columns of `MOMENTS` [M], without scenario and policy. None, NaN, "" or a negative `other`: null."""
-    digest: NDArray[np.uint64]  # [W], of the row and the final state
+    digest: NDArray[np.uint64]  # [R], of the rows and the final state of the world
 
 
 @dataclass(frozen=True)
@@ -182,8 +190,10 @@ def open_results(path: str | Path, *, skip_damaged: bool = False) -> Results:
         if mine:
             rows = pa.concat_tables([chunk.episodes for chunk in mine])
             events = pa.concat_tables([chunk.moments for chunk in mine])
-            episodes.append(rows.sort_by("seed"))
-            moments.append(events.sort_by([("seed", "ascending"), ("rank", "ascending")]))
+            episodes.append(rows.sort_by([("seed", "ascending"), ("ego", "ascending")]))
+            moments.append(
+                events.sort_by([("seed", "ascending"), ("ego", "ascending"), ("rank", "ascending")])
+            )
     if not episodes:
         raise ResultsError(
             f"{path}: no chunk of worlds is finished{' and whole' if damaged else ''} here yet"
@@ -355,8 +365,7 @@ class Shards:
         Raises:
           ResultsError: it cannot be written (disk full, no permission). What was finished stays.
         """
-        seeds = np.asarray(outcome.seeds, np.int64)
-        name = _stem(seeds)
+        name = _stem(np.unique(np.asarray(outcome.seeds, np.int64)))
         about = _about(self.entry)
         _write(self.folder / f"moments-{name}.parquet", _encode(_moments(self.entry, outcome), about))
         path = self.folder / f"episodes-{name}.parquet"
@@ -397,15 +406,17 @@ class Shards:
             yield chunk
 
     def values(self, metric: str) -> dict[int, float]:
-        """A metric by seed, NaN where not measured; reads no other column."""
-        found: dict[int, float] = {}
+        """A metric by seed, the mean of its egos; NaN where not measured. Reads no other column."""
+        found: dict[int, list[float]] = {}
         for path in self._finished():
             with _readable(path):
                 table = pq.ParquetFile(path, page_checksum_verification=True).read(["seed", metric])
-                found |= zip(
-                    table.column("seed").to_pylist(), table.column(metric).to_numpy().tolist(), strict=True
-                )
-        return found
+                seeds, numbers = table.column("seed").to_pylist(), table.column(metric).to_numpy().tolist()
+            mine: dict[int, list[float]] = {}
+            for seed, number in zip(seeds, numbers, strict=True):
+                mine.setdefault(seed, []).append(number)
+            found |= mine
+        return {seed: float(np.mean(numbers)) for seed, numbers in found.items()}
 
     def set_aside(self, error: DamagedError) -> None:
         """Rename a damaged file and its companion, so that their chunk counts as missing."""
@@ -460,6 +471,7 @@ def _episodes(entry: Entry, outcome: Outcome) -> pa.Table:
         pa.array([entry.scenario] * n, pa.string()),
         pa.array([entry.policy] * n, pa.string()),
         pa.array(np.asarray(outcome.seeds, np.int64)),
+        pa.array(np.asarray(outcome.egos, np.int32)),
         pa.array(np.asarray(outcome.digest, np.uint64)),
     ]
     columns += [pa.array(np.asarray(x, np.float64), from_pandas=True) for x in outcome.metrics.values()]

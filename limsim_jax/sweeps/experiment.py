@@ -11,7 +11,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_serializer,
+    field_validator,
+    model_validator,
+)
 
 from limsim_jax.traffic.collision import AfterCollision
 
@@ -22,6 +30,10 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=60)]
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
+NO_POLICY = "traffic"
+"""Name of the policy in results without an ego."""
+
+
 class ExperimentError(ValueError):
     """An experiment cannot be run as it stands; one line that names file and field."""
 
@@ -30,7 +42,7 @@ class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
-class Flow(_Table):
+class FlowTable(_Table):
     """Vehicles that come in: see `traffic.demand.Flow`."""
 
     origin: str | list[str] = "*"
@@ -58,7 +70,7 @@ class TrafficTable(_Table):
     """On the road at the start, the ego not counted unless its start is random."""
     density: NotNegative = 0.0
     """Instead of that, vehicles per km of lane at the start."""
-    flow: list[Flow] = Field(default_factory=list)
+    flow: list[FlowTable] = Field(default_factory=list)
     mix: dict[str, NotNegative] | None = None
     """Shares of vehicle classes."""
     drivers: str | None = None
@@ -129,15 +141,36 @@ class ExperimentFile(_Table):
     slots: Annotated[int, Field(ge=1, le=4096)] = 64
     """Vehicles that can be on the road at once."""
     traffic: TrafficTable = TrafficTable()
-    ego: EgoTable = EgoTable()
+    ego: tuple[EgoTable, ...] = (EgoTable(),)
+    """The vehicle under test, several as `[[ego]]`, or none: `ego = false`."""
     success: dict[str, bool | int | float | Bounds] = Field(default_factory=dict)
     """What counts as success: metrics with the value or the bounds they must keep; absent: to arrive
     without a contact and without leaving the road."""
 
+    @field_validator("ego", mode="before")
+    @classmethod
+    def _as_tuple(cls, found: Any) -> Any:
+        if found is False or found is None:
+            return ()
+        return tuple(found) if isinstance(found, list | tuple) else (found,)
+
+    @field_validator("ego")
+    @classmethod
+    def _one_policy(cls, egos: tuple[EgoTable, ...]) -> tuple[EgoTable, ...]:
+        for ego in egos[1:]:
+            if (ego.policy, ego.options) != (egos[0].policy, egos[0].options):
+                raise ValueError(f"one policy drives all egos; here are {egos[0].policy} and {ego.policy}")
+        return egos
+
+    @field_serializer("ego")
+    def _as_written(self, egos: tuple[EgoTable, ...]) -> Any:
+        plain = [ego.model_dump(mode="json") for ego in egos]
+        return plain[0] if len(plain) == 1 else plain or False
+
     @property
     def policy(self) -> str:
         """Name of the policy, fit for a folder."""
-        return self.ego.policy.rpartition(":")[2]
+        return self.ego[0].policy.rpartition(":")[2] if self.ego else NO_POLICY
 
 
 def bundled_experiments() -> dict[str, Path]:
@@ -209,22 +242,35 @@ def _experiment(
         if drivers.exists():
             found["traffic"] = traffic | {"drivers": str(drivers.resolve())}
     if policy is not None:
-        ego: dict[str, Any] = dict(found.get("ego", {}))
-        if policy != ego.get("policy", EgoTable.model_fields["policy"].default):
-            ego.pop("options", None)  # they are those of the other one
-        found["ego"] = ego | {"policy": policy}
+        found["ego"] = with_policy(found.get("ego", {}), policy, path)
     try:
         return ExperimentFile.model_validate(found)
     except ValidationError as error:
-        raise ExperimentError(f"{path}: {_first(error)}") from None
+        raise ExperimentError(f"{path}: {first_fault(error)}") from None
 
 
-def _first(error: ValidationError) -> str:
+def with_policy(ego: Any, policy: str, where: str | Path) -> Any:
+    """The table of an ego, or the list of them, with another policy."""
+    if isinstance(ego, list):
+        return [with_policy(one, policy, where) for one in ego]
+    if ego is False:
+        raise ExperimentError(f"{where}: ego: there is none that policy '{policy}' could drive")
+    if not isinstance(ego, dict):
+        return ego
+    if policy != ego.get("policy", EgoTable.model_fields["policy"].default):
+        ego = {name: value for name, value in ego.items() if name != "options"}  # of the other policy
+    return ego | {"policy": policy}
+
+
+def first_fault(error: ValidationError) -> str:
     """The first thing that is wrong, in the file's words."""
     errors = error.errors()
     # a name that is mistyped is also missing: the culprit is what stands there
     first = min(errors, key=lambda fault: fault["type"] != "extra_forbidden")
-    where = ".".join(str(part) for part in first["loc"] if not _is_branch(part))
+    parts = [part for part in first["loc"] if not _is_branch(part)]
+    if parts[:2] == ["ego", 0]:  # written as one table
+        parts = ["ego", *parts[2:]]
+    where = ".".join(map(str, parts))
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
         message = "no such field"
@@ -247,7 +293,7 @@ def _fields_at(where: tuple[Any, ...]) -> list[str]:
         (): ExperimentFile,
         ("ego",): EgoTable,
         ("traffic",): TrafficTable,
-        ("traffic", "flow"): Flow,
+        ("traffic", "flow"): FlowTable,
     }
     table = tables.get(tuple(part for part in where if isinstance(part, str)))
     return list(table.model_fields) if table else []

@@ -1,0 +1,1 @@
+"""What users call: experiments, sweeps, results, single worlds and a step-by-step environment."""

@@ -1,0 +1,131 @@
+"""Futures: a world that is stopped at a moment, from which several worlds go on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow as pa
+
+from limsim_jax.api.world import World
+from limsim_jax.metrics.reductions import on_host
+from limsim_jax.policies.base import PolicyLike, policy_name
+from limsim_jax.simulation.trace import trace
+from limsim_jax.sweeps.build import policy_of
+from limsim_jax.sweeps.experiment import with_policy
+from limsim_jax.sweeps.reruns import of_ego
+from limsim_jax.sweeps.what_if import stopped
+
+if TYPE_CHECKING:
+    from limsim_jax.sweeps.episode import Episodes
+    from limsim_jax.types import State
+
+
+class Futures(Sequence[World]):
+    """Worlds that go on from one moment.
+
+    Attributes:
+      worlds: policy by policy, copy by copy.
+      at: s, the moment.
+    """
+
+    def __init__(self, worlds: Sequence[World], at: float) -> None:
+        self.worlds, self.at = list(worlds), at
+
+    def __len__(self) -> int:
+        return len(self.worlds)
+
+    def __getitem__(self, k: Any) -> Any:
+        return self.worlds[k]
+
+    def __iter__(self) -> Iterator[World]:
+        return iter(self.worlds)
+
+    def table(self) -> pa.Table:
+        """A row per future: policy, copy, and every metric from the fork on."""
+        names = list(self.worlds[0].metrics)
+        count: dict[str, int] = {}
+        rows = []
+        for world in self.worlds:
+            copy = count[world.policy] = count.get(world.policy, -1) + 1
+            rows.append({"policy": world.policy, "copy": copy} | {n: world.metrics[n] for n in names})
+        return pa.Table.from_pylist(rows)
+
+    def trajectories(self) -> pa.Table:
+        """All vehicles of all futures in one long table, with columns `policy` and `copy`."""
+        keys = self.table().select(["policy", "copy"]).to_pylist()
+        parts = []
+        for key, world in zip(keys, self.worlds, strict=True):
+            part = world.trajectories()
+            for place, (name, value) in enumerate(key.items()):
+                part = part.add_column(place, name, pa.array([value] * part.num_rows))
+            parts.append(part)
+        return pa.concat_tables(parts, promote_options="default")
+
+    def __repr__(self) -> str:
+        names = ", ".join(dict.fromkeys(world.policy for world in self.worlds))
+        return f"{len(self)} futures from {self.at:g} s on ({names})"
+
+
+def run_futures(
+    world: World,
+    at: float,
+    policies: Sequence[PolicyLike | str | None],
+    count: int,
+    change: Callable[[State, Any], State] | None,
+    seconds: float | None,
+) -> Futures:
+    """What `World.fork` returns."""
+    if count < 1 or not policies:
+        raise ValueError("count: at least one copy of at least one policy is needed")
+    episodes = world.episodes
+    assert episodes is not None
+    now = stopped(episodes, world.seed, [at])
+    state, memory = jax.tree.map(lambda x: x[0], (now.carry.state, now.carry.memory))
+    every = now.run.config.decision_time
+    begin = round(at / every)
+    left = now.run.decisions - begin
+    decisions = left if seconds is None else min(left, max(1, round(seconds / every)))
+    if decisions < 1:
+        raise ValueError(f"at: {at:g} s; nothing is left of {now.run.horizon:g} s")
+    found = []
+    for policy in policies:
+        same, driver, name = _driver(episodes, policy)
+        run = replace(now.run, policy=driver, record=trace)
+
+        def one(k: Any, run: Any = run, same: bool = same) -> Any:
+            changed = state if change is None else change(state, k)
+            kept = memory if same else run.policy.init(run.config, now.lane_map, changed)
+            carry = run.restart(now.lane_map, changed, kept)
+            return run.advance(now.lane_map, now.schedule, now.key, carry, decisions)[0]
+
+        result = jax.device_get(jax.jit(jax.vmap(one))(jnp.arange(count)))
+        columns = of_ego(on_host(result.measures), max(world.ego, 0))
+        for k in range(count):
+            found.append(
+                replace(
+                    world,
+                    policy=name,
+                    trace=jax.tree.map(lambda x: x[k], result.trace),  # noqa: B023
+                    metrics={metric: float(np.asarray(x)[k]) for metric, x in columns.items()},
+                    moments=[],
+                    episodes=None,
+                )
+            )
+    return Futures(found, begin * every)
+
+
+def _driver(episodes: Episodes, policy: PolicyLike | str | None) -> tuple[bool, PolicyLike, str]:
+    """Whether it is the policy of before, the policy, and its name."""
+    if policy is None:
+        return True, episodes.rollout.policy, episodes.policy
+    if isinstance(policy, str):
+        file = episodes.experiment
+        egos = [ego.model_dump() for ego in file.ego]
+        named = type(file).model_validate(file.model_dump() | {"ego": with_policy(egos, policy, file.name)})
+        return False, policy_of(named), named.policy
+    return False, policy, policy_name(policy)

@@ -1,0 +1,290 @@
+"""From the words of an experiment file to a policy, a map, egos and a demand.
+
+What does not fit the map, or names something that is not there, is an `ExperimentError` of one line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib
+import inspect
+import os
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from limsim_jax.maps import bundled_maps
+from limsim_jax.maps.lane_map import lane_rows
+from limsim_jax.maps.map import Map, load_map
+from limsim_jax.maps.network import MapError, Network
+from limsim_jax.maps.origins import origins, road_origins
+from limsim_jax.policies import POLICIES
+from limsim_jax.policies.base import PolicyLike, build_policy
+from limsim_jax.sweeps.experiment import EgoTable, ExperimentError, ExperimentFile
+from limsim_jax.traffic import car_following
+from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand
+from limsim_jax.traffic.engine import Traffic
+from limsim_jax.traffic.population_file import read_population
+from limsim_jax.traffic.vehicles import (
+    URBAN,
+    Population,
+    default_population,
+    restrict_to_map,
+    sample_vehicles,
+    uniform_population,
+)
+from limsim_jax.xla import run_once
+
+MODELS: dict[str, Callable[[], Any]] = {
+    "idm": car_following.IDM,
+    "iidm": car_following.IIDM,
+    "acc": car_following.ACC,
+}
+"""Car-following models by their names in experiment files."""
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+ROADS_OF_A_CLOSED_MAP = 12
+"""Roads, at most, on which traffic comes into a map without origins."""
+
+
+def policy_of(experiment: ExperimentFile) -> PolicyLike:
+    """The policy that the file names, with its options."""
+    if not experiment.ego:
+        return POLICIES["like_traffic"]()
+    name, options = experiment.ego[0].policy, experiment.ego[0].options
+    where = f"{experiment.name}: ego.policy"
+    if ":" in name:
+        factory = _own(name, where)
+    elif name in POLICIES:
+        factory = POLICIES[name]
+    else:
+        raise ExperimentError(
+            f"{where}: unknown policy '{name}'; known are {', '.join(POLICIES)}, or module:factory"
+        )
+    try:
+        policy = build_policy(factory, options)
+    except (TypeError, ValueError) as error:
+        raise ExperimentError(f"{experiment.name}: ego.options: {error}") from None
+    if not isinstance(getattr(policy, "free", None), bool):
+        raise ExperimentError(f"{where}: '{name}' is no policy; see limsim_jax.policies.base.Policy")
+    return policy
+
+
+def _own(name: str, where: str) -> Callable[..., PolicyLike]:
+    """A factory by module and name; modules of the current folder are found, too."""
+    module, _, attribute = name.partition(":")
+    here = os.getcwd()
+    added = here not in sys.path and "" not in sys.path
+    if added:
+        sys.path.append(here)
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ExperimentError(
+            f"{where}: '{name}' cannot be loaded: {error}; looked in the Python path and in {here}"
+        ) from None
+    finally:
+        if added:
+            sys.path.remove(here)
+
+
+def map_of(experiment: ExperimentFile, town: Map | None = None) -> Map:
+    """The map of the file (or this one), with every lane that is named as a goal."""
+    if town is None:
+        try:
+            town = load_map(bundled_maps().get(experiment.map, experiment.map))
+        except MapError as error:
+            known = ", ".join(bundled_maps())
+            hint = "" if os.path.exists(experiment.map) else f"; bundled maps are {known}"
+            raise ExperimentError(f"{experiment.name}: map: {error}{hint}") from None
+    wanted = [ego.goal for ego in experiment.ego if ego.goal]
+    for flow in experiment.traffic.flow:
+        wanted += [flow.goal] if isinstance(flow.goal, str) else list(flow.goal or ())
+    return town.with_goals(wanted)
+
+
+def egos_of(experiment: ExperimentFile, town: Map, free: bool) -> EgoStart | None:
+    """Where the egos start and what they are; None without one."""
+    tables, name = experiment.ego, experiment.name
+    if not tables:
+        return None
+    vehicles = [_vehicle(ego, name) for ego in tables]
+    driver, shape = jax.tree.map(lambda *x: jnp.concatenate(x), *vehicles)
+    speeds = [ego.v for ego in tables]
+    if any(v is None for v in speeds) and any(v is not None for v in speeds):
+        raise ExperimentError(f"{name}: ego.v: {len(tables)} egos need a speed each, or none has one")
+    v = None if speeds[0] is None else jnp.asarray(speeds, jnp.float32)
+    common = {"driver": driver, "shape": shape, "v": v, "free": jnp.asarray([free] * len(tables))}
+    if all(ego.start == "random" for ego in tables):
+        return EgoStart(**common)
+    if any(ego.start == "random" for ego in tables):
+        raise ExperimentError(f"{name}: ego.start: {len(tables)} egos need a start each, or all are random")
+    rows, places, columns = [], [], []
+    for ego, length in zip(tables, shape.length.tolist(), strict=True):
+        row, column = _place(name, ego, town)
+        rows.append(row)
+        columns.append(column)
+        places.append(max(ego.s, length))
+    return EgoStart(
+        lane=jnp.asarray(rows, jnp.int32),
+        s=jnp.asarray(places, jnp.float32),
+        goal=jnp.asarray(columns, jnp.int32),
+        **common,
+    )
+
+
+def _vehicle(ego: EgoTable, name: str) -> Any:
+    """Driver and shape of an ego."""
+    try:
+        population = uniform_population(ego.vehicle, **ego.driver)
+    except ValueError as error:
+        raise ExperimentError(f"{name}: ego: {error}") from None
+    vehicle = jnp.argmax(population.share)[None].astype(jnp.int32)
+    # compiled as one program: operation by operation it takes seconds
+    sample = jax.jit(sample_vehicles, compiler_options=run_once())
+    return sample(population, jax.random.key(0), jnp.zeros(1, jnp.int32), vehicle)
+
+
+def _place(name: str, ego: EgoTable, town: Map) -> tuple[int, int]:
+    """Row of the start lane and column of the goal."""
+    network, lane_map, goals = town.network, town.lanes, town.goals
+    lane = _start_lane(name, ego, network)
+    length = network.lanes[lane].length
+    if not ego.s < length:
+        raise ExperimentError(f"{name}: ego.s: {ego.s:g} m, but lane '{lane}' is only {length:.1f} m long")
+    if ego.goal is None or ego.goal not in goals:
+        raise ExperimentError(f"{name}: ego.goal: no goal or lane '{ego.goal}'; goals are {', '.join(goals)}")
+    row, column = lane_rows(network)[lane], list(goals).index(ego.goal)
+    if not bool(lane_map.routes.reachable[row, column]):
+        can = [goal for k, goal in enumerate(goals) if bool(lane_map.routes.reachable[row, k])]
+        raise ExperimentError(
+            f"{name}: ego.goal: '{ego.goal}' cannot be reached from lane '{lane}'; "
+            f"from there it goes to {', '.join(can) or 'nowhere'}"
+        )
+    return row, column
+
+
+def _start_lane(name: str, ego: EgoTable, network: Network) -> str:
+    """The lane that the ego starts on."""
+    known = origins(network)
+    if ego.start in network.lanes:
+        lanes = [ego.start]
+    elif ego.start in known:
+        lanes = list(known[ego.start])
+    else:
+        road = [lane for lane in network.drivable_lanes() if lane.road == ego.start and lane.junction is None]
+        first = [lane for lane in road if lane.section == min(x.section for x in road)]
+        if len({lane.number < 0 for lane in first}) > 1:
+            raise ExperimentError(
+                f"{name}: ego.start: road '{ego.start}' has traffic both ways; name one of its lanes, as "
+                f"'{first[0].id}'"
+            )
+        lanes = [lane.id for lane in first]
+    if not lanes:
+        raise ExperimentError(
+            f"{name}: ego.start: no origin, road or lane '{ego.start}'; origins are {', '.join(known)}"
+        )
+    rightmost = [lane for lane in lanes if network.lanes[lane].right not in lanes]
+    ordered = rightmost[:1]
+    while ordered and network.lanes[ordered[-1]].left in lanes:
+        ordered.append(str(network.lanes[ordered[-1]].left))
+    if ego.lane >= len(ordered):
+        raise ExperimentError(
+            f"{name}: ego.lane: {ego.lane}, but '{ego.start}' has lanes 0 to {len(ordered) - 1}"
+        )
+    chosen = network.lanes[ordered[ego.lane]]
+    if not chosen.drivable or chosen.junction is not None:
+        raise ExperimentError(f"{name}: ego.start: lane '{chosen.id}' is no lane to start on")
+    return chosen.id
+
+
+def population_of(experiment: ExperimentFile, drivers: Population | None = None) -> Population:
+    """The drivers of the traffic: these, those of the file that is named, or the default ones."""
+    traffic = experiment.traffic
+    if drivers is not None:
+        return drivers
+    shares = URBAN if traffic.mix is None else traffic.mix
+    return default_population(shares) if traffic.drivers is None else read_population(traffic.drivers, shares)
+
+
+def flows_of(experiment: ExperimentFile, town: Map) -> list[Flow]:
+    """The flows of the file; "*" stands for all origins, on a closed map for a dozen of its roads."""
+    every = list(town.origins) or (
+        road_origins(town.network, ROADS_OF_A_CLOSED_MAP) if not experiment.ego else []
+    )
+    found = []
+    for flow in experiment.traffic.flow:
+        for origin in every if flow.origin == "*" else [flow.origin]:
+            fields: dict[str, Any] = flow.model_dump() | {"origin": origin}
+            found.append(Flow(**fields))
+    return found
+
+
+def demand_of(
+    experiment: ExperimentFile, town: Map, egos: EgoStart | None, drivers: Population | None = None
+) -> Demand:
+    """The vehicles of a world, those of the start and those that come later."""
+    traffic = experiment.traffic
+    try:
+        population = restrict_to_map(population_of(experiment, drivers), town.lanes)
+        return build_demand(
+            town.network, town.lanes, town.goals, flows_of(experiment, town), population,
+            horizon=experiment.horizon, density=traffic.density, vehicles=traffic.vehicles, egos=egos,
+        )  # fmt: skip
+    except ValueError as error:
+        raise ExperimentError(f"{experiment.name}: traffic: {error}") from None
+
+
+def traffic_of(experiment: ExperimentFile, model: Any = None) -> Traffic:
+    """How the traffic drives; `model` replaces the car-following model of the file."""
+    traffic = experiment.traffic
+    return Traffic(
+        model=MODELS[traffic.model]() if model is None else model,
+        lane_changes=traffic.lane_changes,
+        after_collision=traffic.after_collision,
+    )
+
+
+def describe(value: Any) -> Any:
+    """A policy, a population, a model or metrics as JSON: what it is and of which numbers.
+
+    Arrays are hashed. A class that comes from a file outside installed packages brings the hash of that file,
+    so that rows of an edited policy are other rows.
+    """
+    if isinstance(value, str | int | float | bool | None):
+        return value
+    if isinstance(value, tuple | list):
+        return [describe(x) for x in value]
+    if isinstance(value, Mapping):
+        return {str(name): describe(x) for name, x in value.items()}
+    if isinstance(value, np.ndarray | jax.Array):
+        array = np.asarray(value)
+        return f"{array.dtype}{list(array.shape)} {hashlib.sha256(array.tobytes()).hexdigest()[:16]}"
+    kind = value if isinstance(value, type | FunctionType) else type(value)
+    found = {"is": f"{kind.__module__}.{kind.__qualname__}"}
+    if source := _own_source(kind):
+        found["source"] = source
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        found |= {x.name: describe(getattr(value, x.name)) for x in dataclasses.fields(value)}
+    elif not isinstance(value, type | FunctionType):
+        found |= {name: describe(x) for name, x in sorted(getattr(value, "__dict__", {}).items())}
+    return found
+
+
+def _own_source(kind: Any) -> str | None:
+    """Hash of the file of a class or function, unless it comes with an installed package."""
+    try:
+        path = Path(inspect.getsourcefile(kind) or "")
+        if not path.is_file() or path.is_relative_to(_PACKAGE) or "site-packages" in path.parts:
+            return None
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    except (TypeError, OSError):  # built in, or typed into a notebook
+        return None

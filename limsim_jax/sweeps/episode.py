@@ -1,0 +1,326 @@
+"""An experiment as episodes: a seed in, a row of metrics out; thousands of them at once."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import math
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+import limsim_jax
+from limsim_jax.maps import bundled_maps
+from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.maps.map import Map
+from limsim_jax.maps.network import Network
+from limsim_jax.maps.xml import file_hash
+from limsim_jax.metrics.catalog import TOTALS
+from limsim_jax.metrics.measure import Metric
+from limsim_jax.metrics.reductions import on_host
+from limsim_jax.policies.base import PolicyLike
+from limsim_jax.simulation.rollout import Rollout
+from limsim_jax.simulation.totals import Totals
+from limsim_jax.simulation.worlds import Worlds
+from limsim_jax.sweeps._shim import EvaluateEgo, EvaluateTraffic
+from limsim_jax.sweeps.build import (
+    demand_of,
+    describe,
+    egos_of,
+    map_of,
+    policy_of,
+    traffic_of,
+)
+from limsim_jax.sweeps.experiment import NO_POLICY, Bounds, ExperimentError, ExperimentFile
+from limsim_jax.sweeps.moments import key_moments
+from limsim_jax.sweeps.reruns import Replay, Reruns
+from limsim_jax.sweeps.store import Outcome
+from limsim_jax.traffic.car_following import CarFollowing
+from limsim_jax.traffic.demand import sample_scenario
+from limsim_jax.traffic.ego import with_rows
+from limsim_jax.traffic.vehicles import Population
+from limsim_jax.types import Config, Scenario, State
+
+_SHARE_OF_MEMORY = 0.25
+_TEMPORARIES = 12  # memory of a running world, in units of its arrays
+_CHUNKS = {"cpu": 50, "gpu": 2000, "tpu": 2000}
+"""Worlds per call, if memory allows: round numbers of seeds leave no chunk half empty."""
+
+_NO_PART_OF_ROWS = ("api", "bench", "bench.py", "cli", "report")
+"""Rooms whose code changes no row."""
+
+
+class Episodes:
+    """Runs an experiment, chunk by chunk; `rollout`, `lane_map` and `sample` are what it is made of.
+
+    Args:
+      experiment: the file's tables.
+      chunk: worlds per call; by default as many as memory allows, at most 50 on CPUs and 2000 on others.
+      policy: drives the egos; None: the one that the experiment names.
+      name: of the policy in results; None: that of the experiment.
+      town: the map; None: the one that the experiment names.
+      drivers: population of the traffic; None: the one of the experiment.
+      model: car-following model; None: the one of the experiment.
+      metrics: own metrics beside the built-in ones.
+
+    Raises:
+      ExperimentError: the experiment does not fit its map or names something that is not there; one line.
+    """
+
+    def __init__(
+        self,
+        experiment: ExperimentFile,
+        *,
+        chunk: int | None = None,
+        policy: PolicyLike | None = None,
+        name: str | None = None,
+        town: Map | None = None,
+        drivers: Population | None = None,
+        model: CarFollowing | None = None,
+        metrics: Sequence[Metric] = (),
+    ) -> None:
+        self.experiment = experiment
+        self.scenario = experiment.name
+        self.policy = NO_POLICY if not experiment.ego else experiment.policy if name is None else name
+        self._values = {"policy": policy, "drivers": drivers, "model": model, "metrics": tuple(metrics)}
+        self._policy = policy_of(experiment) if policy is None else policy
+        self.town = map_of(experiment, town)
+        self._egos = egos_of(experiment, self.town, self._policy.free)
+        self._measure = self._measures(tuple(metrics))
+        self.units = self._units()
+        self._check_success()
+        self._demand = demand_of(experiment, self.town, self._egos, drivers)
+        self._check_room()
+        config = Config(dt=experiment.dt, decision_every=experiment.decision_every)
+        behaviour = traffic_of(experiment, model)
+        self.rollout = Rollout(config, behaviour, experiment.horizon, self._policy, measure=self._measure)
+        self._check_policy()
+        self.world_bytes = self._memory()
+        self.chunk = self._chunk() if chunk is None else chunk
+        self._worlds = Worlds(self.rollout, self.lane_map, self.sample, chunk=self.chunk)
+        self.chunk = self._worlds.chunk
+
+    @property
+    def egos(self) -> int:
+        """Vehicles under test."""
+        return 0 if self._egos is None else self._egos.count
+
+    @property
+    def network(self) -> Network:
+        """The map on the host."""
+        return self.town.network
+
+    @property
+    def lane_map(self) -> LaneMap:
+        """The map on the device."""
+        return self.town.lanes
+
+    def _measures(self, metrics: tuple[Metric, ...]) -> EvaluateEgo | EvaluateTraffic:
+        if self.egos:
+            return EvaluateEgo(egos=self.egos, metrics=metrics)
+        if metrics:
+            self._refuse("metrics", f"'{metrics[0].name}' is of an ego, and there is none")
+        return EvaluateTraffic()
+
+    def _units(self) -> dict[str, str]:
+        units = dict(self._measure.units)
+        if self.experiment.success and "success" not in units:
+            units = {"success": "1 if the criteria of the experiment are met"} | units
+        return units | {total.name: total.meaning for total in TOTALS}
+
+    def _refuse(self, field: str, message: str) -> None:
+        raise ExperimentError(f"{self.experiment.name}: {field}: {message}")
+
+    def _check_success(self) -> None:
+        unknown = [name for name in self.experiment.success if name not in self.units]
+        if unknown:
+            self._refuse(f"success.{unknown[0]}", f"no such metric; known are {', '.join(self.units)}")
+
+    def _check_room(self) -> None:
+        placed = self._egos is not None and self._egos.lane is not None
+        room = self._demand.initial + (self.egos if placed else 0)
+        if room > self.experiment.slots:
+            self._refuse("slots", f"{self.experiment.slots}, but {room} vehicles are there at the start")
+        if not placed and room < self.egos:
+            one = self.egos == 1
+            starts = "a random start needs" if one else f"{self.egos} random starts need"
+            needed = "one vehicle" if one else f"{self.egos} vehicles"
+            self._refuse("traffic.density", f"{starts} at least {needed} at the start")
+
+    def _check_policy(self) -> None:
+        """Trace a policy of one's own once: what is wrong with it is one line, not a trace of a compiler."""
+        if type(self._policy).__module__.startswith("limsim_jax."):
+            return
+
+        def start(key: jax.Array) -> State:
+            state = self.sample(key).start
+            return replace(state, egos=with_rows(state.egos, getattr(self._policy, "others", 0)))
+
+        state = jax.eval_shape(start, jax.random.key(0))
+        try:
+            check_policy(self._policy, self.rollout.config, self.lane_map, state)
+        except ValueError as error:
+            self._refuse("policy", str(error))
+
+    def sample(self, key: jax.Array) -> Scenario:
+        """The scenario of a world."""
+        return sample_scenario(self._demand, self.lane_map, key, self.experiment.slots, self._egos)
+
+    def _memory(self) -> int:
+        """Bytes that one more world needs: its arrays at the start, and temporaries in proportion."""
+        scenario = jax.eval_shape(self.sample, jax.random.key(0))
+        return _TEMPORARIES * sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(scenario))
+
+    def _chunk(self) -> int:
+        device = jax.local_devices()[0]
+        stats = device.memory_stats() if device.platform != "cpu" else None
+        if stats and "bytes_limit" in stats:
+            memory = stats["bytes_limit"] * jax.local_device_count()
+        else:
+            memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        most = int(_SHARE_OF_MEMORY * memory / self.world_bytes)
+        most = max(1, min(most, _CHUNKS.get(device.platform, 50)))
+        size = 10 ** (len(str(most)) - 1)
+        return max(k * size for k in (1, 2, 5) if k * size <= most)
+
+    def provenance(self) -> dict[str, Any]:
+        """Where the rows come from."""
+        device = jax.local_devices()[0]
+        drivers = self.experiment.traffic.drivers
+        return {
+            **({"drivers": file_hash(Path(drivers).read_bytes())} if drivers is not None else {}),
+            **{name: describe(value) for name, value in self._values.items() if value},
+            "experiment": self.experiment.model_dump(mode="json", exclude={"map"}),
+            "map": {"file": os.path.basename(self.network.source), "hash": self.network.file_hash},
+            "map_file": self._map_file(),
+            "version": limsim_jax.__version__,
+            "source": _source_hash(),
+            "chunk": self.chunk,
+            "platform": device.platform,
+            "device": device.device_kind,
+            "devices": jax.local_device_count(),
+            "machine": platform.machine(),
+            "python": platform.python_version(),
+            "jax": jax.__version__,
+            "jaxlib": importlib.import_module("jaxlib").__version__,
+            "memory": {
+                "bytes_per_world": self.world_bytes,
+                "share_of_memory": _SHARE_OF_MEMORY,
+                "bytes_per_chunk": self.world_bytes * self.chunk,
+            },
+        }
+
+    def _map_file(self) -> str:
+        """Where to find the map again: a bundled one by its name."""
+        name = self.experiment.map
+        return name if name in bundled_maps() else os.path.abspath(name)
+
+    def compile(self) -> None:
+        """Compile now; otherwise the first chunk does."""
+        self._worlds.compile()
+
+    def run(self, seeds: Sequence[int]) -> Outcome:
+        """Run at most `chunk` worlds."""
+        if len(seeds) > self.chunk:
+            raise ValueError(f"{len(seeds)} seeds at once; at most {self.chunk}")
+        (_, result), *_ = self._worlds.chunks(seeds)
+        metrics = self._columns(result.measures, result.totals)
+        each = max(self.egos, 1)
+        rows = np.repeat(np.asarray(seeds, np.int64), each)
+        egos = np.tile(np.arange(each, dtype=np.int32), len(seeds))
+        return Outcome(
+            seeds=rows,
+            egos=egos,
+            metrics=metrics,
+            moments=key_moments(rows, egos, metrics),
+            digest=_digest(metrics, result.state, each),
+        )
+
+    def _columns(self, measures: Any, totals: Totals) -> dict[str, NDArray[np.float64]]:
+        """Columns with a row per world and ego, `[W E]`."""
+        found: dict[str, NDArray[np.float64]] = dict(on_host(measures))
+        for column in TOTALS:
+            counted = getattr(totals, column.name.removeprefix("traffic_"))
+            found[column.name] = np.asarray(counted, float)
+        each = max(self.egos, 1)
+        metrics = {name: x.ravel() if x.ndim == 2 else np.repeat(x, each) for name, x in found.items()}
+        if self.experiment.success:
+            metrics["success"] = _succeeds(metrics, self.experiment.success)
+        return {name: metrics[name] for name in self.units}
+
+    @cached_property
+    def _reruns(self) -> Reruns:
+        return Reruns(self.rollout, self.lane_map, self.sample)
+
+    def replay(self, seed: int, ego: int = 0, *, explain: bool = True) -> Replay:
+        """Run one world again and keep every step.
+
+        Args:
+          seed: of the world.
+          ego: whose metrics and key moments.
+          explain: find out which vehicle or module could have avoided the worst moment: see
+            `Reruns.explain`.
+        """
+        if not 0 <= ego < max(self.egos, 1):
+            raise ValueError(f"ego {ego}: the experiment has egos 0 to {self.egos - 1}")
+        result = self._reruns.run(seed)
+        metrics = self._columns(result.measures, result.totals)
+        metrics = {name: x[ego : ego + 1] for name, x in metrics.items()}
+        moments = key_moments(np.asarray([seed], np.int64), np.asarray([ego], np.int32), metrics)
+        columns = {name: column.tolist() for name, column in moments.items()}
+        rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        found = {name: float(x[0]) for name, x in metrics.items()}
+        worst = rows[0]["kind"] if rows else None
+        if explain and worst in ("contact", "off_road", "red_light"):
+            rows[0] |= self._reruns.explain(seed, ego, found, worst, result.trace)
+        return Replay(self.network, self.lane_map, result.trace, ego if self.egos else -1, rows, found)
+
+
+@cache
+def _source_hash() -> str:
+    """Of all code, and weights, that make rows: rows of other code are other rows."""
+    package = Path(limsim_jax.__file__).parent
+    hashed = hashlib.sha256()
+    for path in sorted([*package.rglob("*.py"), *package.rglob("*.npz")]):
+        if path.relative_to(package).parts[0] in _NO_PART_OF_ROWS:
+            continue
+        hashed.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
+    return hashed.hexdigest()[:16]
+
+
+def _succeeds(
+    metrics: Mapping[str, NDArray[np.float64]], criteria: Mapping[str, bool | float | Bounds]
+) -> NDArray[np.float64]:
+    """1 where all criteria are met; a value that is missing meets none."""
+    good = np.ones(len(next(iter(metrics.values()))), bool)
+    for name, wanted in criteria.items():
+        value = metrics[name]
+        if isinstance(wanted, Bounds):
+            least, most = wanted.min, wanted.max
+            good &= value >= (-np.inf if least is None else least)
+            good &= value <= (np.inf if most is None else most)
+        else:
+            good &= value == float(wanted)
+    return good.astype(float)
+
+
+def _digest(metrics: Mapping[str, NDArray[np.float64]], state: Any, each: int) -> NDArray[np.uint64]:
+    """A hash of every world's rows and final state, the same for all `each` rows of a world."""
+    leaves = [np.asarray(x) for x in jax.tree.leaves(state)]
+    columns = np.stack([metrics[name] for name in metrics], -1)
+    columns = columns.reshape(-1, each, columns.shape[-1])
+    digests = []
+    for i in range(len(columns)):
+        hashed = hashlib.blake2b(np.ascontiguousarray(columns[i]).tobytes(), digest_size=8)
+        for leaf in leaves:
+            hashed.update(leaf[i].tobytes())
+        digests.append(int.from_bytes(hashed.digest(), "little"))
+    return np.repeat(np.asarray(digests, np.uint64), each)
