@@ -26,7 +26,7 @@ from limsim_jax.maps.xml import file_hash
 from limsim_jax.metrics.catalog import TOTALS
 from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.reductions import on_host
-from limsim_jax.policies.base import PolicyLike
+from limsim_jax.policies.base import PolicyLike, check_policy
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.totals import Totals
 from limsim_jax.simulation.worlds import Worlds
