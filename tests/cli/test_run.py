@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from limsim_jax import bench, cli
-from limsim_jax.cli import trace as trace_file
 from limsim_jax.maps import build_lane_map, bundled_map, read_network
+from limsim_jax.simulation import table as trace_file
 from limsim_jax.types import Status
 
 SECONDS, SLOTS, START = 3.0, 24, 9

@@ -10,8 +10,9 @@ from limsim_jax.maps.lane_map import NO_LANE
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.metrics.safety import encounter, overlaps
 from limsim_jax.policies.simple import ConstantSpeed, FollowLane
-from limsim_jax.sweeps.episode import Episodes, _moments, _succeeds
+from limsim_jax.sweeps.episode import Episodes, _succeeds
 from limsim_jax.sweeps.experiment import Bounds, ExperimentFile
+from limsim_jax.sweeps.moments import key_moments
 
 SEEDS = (0, 3, 5)
 SLOTS = 32
@@ -186,8 +187,9 @@ def rows(**columns):
 
 def test_key_moments_are_ranked():
     nan = np.nan
-    found = _moments(
+    found = key_moments(
         np.array([7, 9]),
+        np.array([0, 0], np.int32),
         rows(
             contact_time=[nan, 12.0], contact_delta_v=[nan, 6.5], contact_other=[nan, 4],
             contact_responsibility=[nan, 1], min_ttc_time=[3.0, 11.9], min_ttc=[1.2, 0.0],
