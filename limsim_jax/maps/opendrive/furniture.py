@@ -562,7 +562,10 @@ def _crossing(lane: Lane, start: Array, end: Array) -> float | None:
 
 
 def inside_polygon(points: Array, outline: Array) -> np.ndarray:
-    """Even-odd rule for points `[M, 2]` and a polygon `[K, 2]`."""
+    """Even-odd rule for points `[M, 2]` and a polygon `[K, 2]`.
+
+    Samples often lie on the outline. It belongs to one side of the polygon, where shapely takes all or none.
+    """
     x, y = points[:, 0, None], points[:, 1, None]
     x0, y0 = outline.T
     x1, y1 = np.roll(outline, -1, 0).T
