@@ -169,7 +169,7 @@ def _without_side_steps(network: Network, report: ImportReport | None) -> Networ
                     "lane link",
                     f"{lane.id} -> {name}",
                     f"{name} begins {step:.1f} m beside the end of {lane.id}: traffic changes to "
-                    f"{going[0].id}, which goes on as it",
+                    f"{going[0].id}, which continues as {name}",
                 )
     return network if lanes == network.lanes else replace(network, lanes=lanes)
 

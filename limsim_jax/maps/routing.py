@@ -24,10 +24,10 @@ Array = np.ndarray | jax.Array
 Floats = NDArray[np.float64]
 
 FAR = 1e9
-"""Distance (m) to what cannot be reached, or to a lane change that is not needed."""
+"""Distance (m) to a goal out of reach, or to a lane change that is not needed."""
 
 CHANGE_PENALTY = 30.0
-"""Metres of detour that are preferred to one lane change."""
+"""Detour that is preferred to one lane change, m."""
 
 ROOM_TO_CHANGE, SHORT_PENALTY = 30.0, 300.0
 """m: on a lane shorter than the first, a change costs more, up to a detour of the second at no length."""
@@ -40,15 +40,15 @@ drive on to it.
 """
 
 TOLERANCE = 5.0
-"""Metres by which lanes that lead to the same place may differ in length and still be equally good."""
+"""Difference of length within which lanes to the same place are equally good, m."""
 
 
 @flax.struct.dataclass(kw_only=True)
 class RouteTable:
     """The way from every lane to every goal: `L - 1` lanes and, last, the null lane; `G` goals.
 
-    The null lane reaches nothing. Take two lanes of 100 m, A on the right and B on the left, of which
-    only B leads on, to C (50 m), the goal; lane changes are allowed and cost 30 m:
+    The null lane reaches no goal. An example: two lanes of 100 m, A on the right and B on the left. Only B
+    has a successor: C (50 m), the goal. Lane changes are allowed and cost 30 m:
 
     ====  ========  =========  ===========  ===============  =======
     lane  distance  next_lane  lanes_to_go  change_distance  is_goal
@@ -59,8 +59,8 @@ class RouteTable:
     ====  ========  =========  ===========  ===============  =======
 
     A vehicle at s = 80 m on A has one lane to cross to the left and 100 - 80 = 20 m left to do so.
-    Were there another pair of lanes like A and B before these, the one that leads to A would have the
-    same `lanes_to_go` and `change_distance` 200: the change can be put off until the end of A.
+    A lane of 100 m before A, beside one before B, would have the same `lanes_to_go` and `change_distance`
+    200: the change can wait until the end of A.
     """
 
     distance: Float[Array, "L G"]
@@ -71,7 +71,7 @@ class RouteTable:
     goal cannot be reached without changing lanes before that (or on a lane below `NO_ROOM` only)."""
     lanes_to_go: Int[Array, "L G"]
     """Lanes to cross (+ to the left, - to the right) the next time that the best route must change
-    lanes; 0 if it never has to. Changes are put off as long as that costs nothing."""
+    lanes; 0 if it never has to. Changes wait as long as that costs nothing."""
     change_distance: Float[Array, "L G"]
     """From the start of this lane to the end of the last lane on which that change is possible, m;
     1e9 if `lanes_to_go` is 0. Subtract the vehicle's s."""
@@ -182,7 +182,7 @@ def build_fixed_routes(
 
     A column knows only the lanes of its roads, and the connectors between one road and the next; its
     goal is the end of the last road. Cut routes that visit a road twice with `split_route`: the
-    vehicle then goes on to the column of the next leg.
+    vehicle then switches to the column of the next leg.
 
     Raises:
         MapError: a road that is not on the map, comes twice in a route, or from which no lane leads to

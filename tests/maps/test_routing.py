@@ -168,7 +168,7 @@ def test_loops_and_goals_on_the_way():
     goals = {f"r{i}_": (f"r{i}_0",) for i in range(4)}
     assert default_goals(net) == goals
     ends = [lane for i in range(4) for lane in road(f"r{i}_", [100, 60], {0: [f"r{(i + 1) % 4}_0"]})]
-    assert default_goals(network(ends)) == goals, "a lane that ends beside one that goes on is none"
+    assert default_goals(network(ends)) == goals, "a lane that ends beside one that continues is no goal"
 
 
 def test_default_goals_are_the_exits():

@@ -1,4 +1,4 @@
-"""Drawings: what is on the axes agrees with the network, and files are what their suffix says."""
+"""Drawings agree with the network, and files have the format of their suffix."""
 
 import itertools
 import math

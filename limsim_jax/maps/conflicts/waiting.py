@@ -24,8 +24,8 @@ def waiting_points(
     """Where traffic can wait inside the junction.
 
     The point lies `before` m ahead of the first conflict with a foe that has priority, and `at_least` m
-    into the junction. The file says which movements have one. A file that says nothing of this has one
-    for every turn across opposing traffic.
+    into the junction. The file names the movements that have one. In a file that names none, every turn
+    across opposing traffic has one.
 
     Returns:
         Arc length (m) from the start of each connector, 0 for nowhere.

@@ -1,4 +1,4 @@
-"""Shapes that stand for something else: dashed lines and arrows."""
+"""Symbols of a drawing: dashed lines and arrows."""
 
 from __future__ import annotations
 
