@@ -66,7 +66,7 @@ def polynomial(coefficients: Sequence[Any] | NDArray[Any], u: Any) -> Any:
 
 
 def derivative(coefficients: Sequence[Any] | NDArray[Any]) -> list[Any]:
-    """Coefficients of the derivative of the polynomial with these coefficients (two or more)."""
+    """Coefficients of the derivative of a polynomial, given two or more coefficients."""
     return [power * coefficient for power, coefficient in enumerate(coefficients)][1:]
 
 
@@ -82,7 +82,7 @@ def box_corners(box: Box) -> Float[Array, "4 2"]:
 
 
 def box_separation(a: Box, b: Box) -> Float[Array, ""]:
-    """Largest gap between two boxes along the four directions of their sides, m.
+    """Largest gap (m) between two boxes along the directions of their sides.
 
     Positive: they are apart, by at least that much. Negative: they overlap, and moving one by that much
     along the best of the four directions parts them (separating-axis theorem; Gottschalk et al. 1996).

@@ -1,7 +1,8 @@
-"""What is fixed for a run (`Config`), for an episode (`Scenario`), and what a step changes (`State`).
+"""The types of a simulation.
 
-Shapes stand at the fields: `N` vehicle slots, `V` vehicles of a schedule, `O` origins, `E` egos. All
-types describe one world; a batch is a `vmap`. SI units, radians, counter-clockwise; `d > 0` is left.
+`Config` is fixed for a run, `Scenario` for an episode; a step changes the `State`. Shapes stand at the
+fields: `N` vehicle slots, `V` vehicles of a schedule, `O` origins, `E` egos. All types describe one world;
+a batch is a `vmap`. SI units, radians, counter-clockwise; `d > 0` is left.
 """
 
 from __future__ import annotations
@@ -169,7 +170,7 @@ class State:
 
 @struct.dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """One episode: how it starts, and who comes later. `Egos` are part of the start."""
+    """One episode: its start, which includes the egos, and the vehicles that enter later."""
 
     start: State
     schedule: Schedule

@@ -27,9 +27,10 @@ def origins(network: Network) -> dict[str, tuple[str, ...]]:
 
 
 def road_origins(network: Network, count: int) -> list[str]:
-    """Names of at most `count` roads that serve as origins on a map without `origins`.
+    """Names of roads that serve as origins on a map without `origins`.
 
-    Spread evenly over the map's list of roads; none is shorter than `LEAST_LENGTH`.
+    At most `count` of them, spread evenly over the map's list of roads. None is shorter than
+    `LEAST_LENGTH`.
     """
     names = [
         name

@@ -99,7 +99,10 @@ class ACC:
 
 
 def per_obstacle(driver: Driver) -> Driver:
-    """The driver `[N]` as `[N, 1]`, for arguments `[N, K]` (and `v`, `v0` as `[N, 1]`)."""
+    """The driver `[N]` as `[N, 1]`, for arguments of several obstacles.
+
+    These are `[N, K]`, with `v` and `v0` as `[N, 1]`.
+    """
     return jax.tree.map(lambda x: x[..., None], driver)
 
 
@@ -119,7 +122,7 @@ def desired_speed(driver: Driver, speed_limit: Values, curvature: Values) -> Flo
 def ballistic(
     v: Values, a: Values, dt: float | Float[Array, ""]
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
-    """One step of constant acceleration that ends early where the vehicle comes to rest.
+    """One step of constant acceleration; a vehicle that stops stays there.
 
     Exact for a constant acceleration; with a model behind it, of first order in `dt`, like Euler's method
     but with a smaller error (Treiber, Kanagaraj 2015). Never reverses: where the vehicle stops within the
@@ -141,7 +144,7 @@ def ballistic(
 
 
 def equilibrium_gap(model: CarFollowing, driver: Driver, v: Values, v0: Values) -> Float[Array, "*b"]:
-    """Gap at which a vehicle follows another of the same constant speed, m.
+    """Gap (m) to a leader of the same constant speed.
 
     IDM: (s0 + v T) / sqrt(1 - (v / v0)^delta), and `NO_GAP` from v = v0 on; others: s0 + v T.
     """
@@ -154,12 +157,15 @@ def equilibrium_gap(model: CarFollowing, driver: Driver, v: Values, v0: Values) 
 def equilibrium_flow(
     model: CarFollowing, driver: Driver, length: Values, v: Values, v0: Values
 ) -> Float[Array, "*b"]:
-    """Flow of equal vehicles of `length` m in equilibrium at speed `v`, vehicles/s (fundamental diagram)."""
+    """Flow (vehicles/s) of equal vehicles in equilibrium: the fundamental diagram.
+
+    `length` in m, `v` in m/s.
+    """
     return v / (equilibrium_gap(model, driver, v, v0) + length)
 
 
 def string_stability(driver: Driver, v: Values, v0: Values) -> Float[Array, "*b"]:
-    """f_v^2 - f_l^2 - 2 f_s of the IDM in equilibrium at `v < v0`, 1/s^2.
+    """String stability of the IDM in equilibrium at `v < v0`: f_v^2 - f_l^2 - 2 f_s, 1/s^2.
 
     f_s, f_v, f_l: derivatives of the acceleration by gap, own and leader's speed. Platoons amplify
     perturbations from vehicle to vehicle where it is negative (Treiber, Kesting 2013, ch. 15). The IIDM
@@ -185,7 +191,7 @@ def _limited(driver: Driver, gap: Array, acceleration: Array) -> Array:
 
 
 def _desired_gap(driver: Driver, v: Array, v_lead: Array) -> Array:
-    """s* = s0 + max(0, v T + v (v - v_lead) / (2 sqrt(a b)))."""
+    """Desired gap of the IDM: s* = s0 + max(0, v T + v (v - v_lead) / (2 sqrt(a b)))."""
     root = 2 * jnp.sqrt(jnp.maximum(driver.a * driver.b, _MIN_RATE**2))
     return driver.s0 + jnp.maximum(v * (driver.T + (v - v_lead) / root), 0)
 
@@ -197,7 +203,7 @@ def _speed_ratio(v: Array, v0: Array) -> Array:
 
 
 def _power(base: Array, exponent: Array) -> Array:
-    """base**exponent for base >= 0 and exponent > 0, with finite derivatives by both at base = 0."""
+    """Power with finite derivatives at 0: base**exponent for base >= 0, exponent > 0."""
     positive = base > 1e-6
     return jnp.where(positive, jnp.exp(exponent * jnp.log(jnp.where(positive, base, 1))), 0)
 
@@ -239,10 +245,11 @@ def _constant_acceleration_heuristic(
 
 
 def safe_speed(driver: Driver, gap: Float[Array, " N"], v_lead: Float[Array, " N"]) -> Float[Array, " N"]:
-    """Speed (m/s) from which a driver who reacts after T and brakes with b keeps s0 behind the leader.
+    """Largest speed (m/s) that lets a driver stop s0 behind the leader.
 
-    Gipps (1981), Transp. Res. B 15, 105, eq. 8, for a leader that brakes as hard. At the leader's speed
-    where the gap is s0 + v T.
+    The driver reacts after T and brakes with b. Gipps (1981), Transp. Res. B 15, 105, eq. 8, for a
+    leader that brakes as hard. Equals the leader's speed where the gap is s0 + v T. `gap` in m, `v_lead` in
+    m/s.
     """
     bt = driver.b * driver.T
     square = bt * bt + v_lead * v_lead + 2 * driver.b * (gap - driver.s0)

@@ -1,6 +1,6 @@
-"""Who touches whom, who leaves the road, who drives against the traffic. Recorded, never removed.
+"""Contacts, vehicles off the road, wrong-way driving: recorded, never removed.
 
-`record` writes the bits of `State.status`; what a collision leads to is the choice `AfterCollision`.
+`record` writes the bits of `State.status`; `AfterCollision` says what collided vehicles do.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from limsim_jax.types import Config, State, Status
 from limsim_jax.xla import computed_once
 
 REACH = 1.0
-"""m, how far `contacts` looks; what is farther away counts as this far."""
+"""m, range of `contacts`; what is farther away counts as this far."""
 
 OVERHANG = 0.3
-"""m, how far a body may stand out from the lanes; nuPlan's drivable-area metric allows as much."""
+"""m that a body may stand out from the lanes, as in nuPlan's drivable-area metric."""
 
 AfterCollision = Literal["stop", "continue", "end"]
-"""What collided vehicles do: brake to a standstill and stay, go on as if nothing had happened, or end the
-episode (they go on until whoever runs it stops, see `collided`)."""
+"""What collided vehicles do: brake to a standstill and stay, continue as if nothing had happened, or end the
+episode (they continue until the caller stops, see `collided`)."""
 
 _TILT = 0.5  # rad: the sweep runs at an angle to streets, which mostly run north or east
 _QUANTUM = 16.0  # levels of a sort key per metre
@@ -54,8 +54,8 @@ CLEARANCE = 3.0
 class Contacts(NamedTuple):
     """The nearest other body of every vehicle."""
 
-    other: Int[Array, " N"]  # slot of the nearest body if it touches that, else -1
-    nearest: Int[Array, " N"]  # slot of the nearest body within `REACH`, else -1
+    other: Int[Array, " N"]  # slot of the nearest body if they touch, -1 otherwise
+    nearest: Int[Array, " N"]  # slot of the nearest body within `REACH`, -1 if there is none
     separation: Float[
         Array, " N"
     ]  # m to it as `geometry.box_separation`, negative in contact; at most `REACH`
@@ -75,15 +75,18 @@ class _Bodies(NamedTuple):
 def contacts(
     box: Float[Array, "N 5"], active: Bool[Array, " N"], z: Float[Array, " N"] | None = None
 ) -> Contacts:
-    """The nearest body of every vehicle and whether they touch, exact for any number of vehicles.
+    """The nearest body of every vehicle, and whether they touch.
 
-    Sweep and prune: bodies are sorted by where they begin along one direction, and each is compared with
-    the first, second, ... one after and before it as long as any two of them can be within `REACH`. So the
-    result depends on no list length; only the time depends on how dense the traffic is. The comparison is
-    the separating-axis test. Bodies with numbers that are not finite touch nobody. Without gradient: that
-    of `geometry.box_separation` to `nearest` is meaningful.
+    Exact for any number of vehicles. Sweep and prune: bodies are sorted by where they begin along one
+    direction. Each is compared with the first, second, ... one after and before it, as long as any two of
+    them can be within `REACH`. So only the time depends on how dense the traffic is. The comparison is the
+    separating-axis test. Bodies with numbers that are not finite touch none. There is no gradient; that of
+    `geometry.box_separation` to `nearest` is meaningful.
 
-    `z`: m, elevation; bodies more than `CLEARANCE` apart in height are out of reach.
+    Args:
+      box: x, y (m), heading (rad), length, width (m).
+      active: vehicles that count.
+      z: m, elevation; bodies more than `CLEARANCE` apart in height are out of reach.
     """
     n = box.shape[0]
     box = lax.stop_gradient(box)
@@ -98,7 +101,7 @@ def contacts(
     bodies = computed_once(_Bodies(*(values[order] for values in bodies)))
     ring = _Bodies(*(jnp.concatenate([values, values]) for values in bodies))
 
-    begin = jnp.concatenate([begin, jnp.full(n, 2**32 - 1, begin.dtype)])  # nobody follows the last
+    begin = jnp.concatenate([begin, jnp.full(n, 2**32 - 1, begin.dtype)])  # none follows the last
 
     def meet(step: Array) -> Array:
         # whether any two that are `step` places apart can; if none do, none that are farther apart do
@@ -115,8 +118,8 @@ def contacts(
         return step + 1, meet(step + 1), nearest, least
 
     first = jnp.int32(1)
-    nobody = (first, meet(first), jnp.full(n, -1, jnp.int32), jnp.full(n, REACH, box.dtype))
-    _, _, nearest, least = lax.while_loop(lambda carry: carry[1], compare, nobody)
+    alone = (first, meet(first), jnp.full(n, -1, jnp.int32), jnp.full(n, REACH, box.dtype))
+    _, _, nearest, least = lax.while_loop(lambda carry: carry[1], compare, alone)
     nearest = jnp.where(nearest >= 0, order[nearest % n], -1)
     place = jnp.zeros(n, jnp.int32).at[order].set(me, unique_indices=True)
     nearest, least = nearest[place], least[place]
@@ -126,9 +129,10 @@ def contacts(
 def _sweep(
     bodies: _Bodies, active: Bool[Array, " N"]
 ) -> tuple[Int[Array, " N"], UInt[Array, " N"], UInt[Array, " N"]]:
-    """Slots in order along the sweep, and where each begins and ends, in levels of the key.
+    """Slots in order along the sweep, and where each begins and ends.
 
-    One integer holds place and slot: sorting those is ten times as fast as sorting pairs.
+    Ends are in levels of the key. One integer holds place and slot: sorting those is ten times as fast as
+    sorting pairs.
     """
     n = active.shape[0]
     bits = max(1, (n - 1).bit_length())
@@ -180,13 +184,19 @@ def _separation(a: _Bodies, b: _Bodies) -> Float[Array, " N"]:
 def off_road(
     lane_map: LaneMap, state: State, box: Float[Array, "N 5"], *, free: bool = True
 ) -> Bool[Array, " N"]:
-    """Vehicles with a part of the body more than `OVERHANG` beyond the lanes for motor traffic.
+    """Vehicles of which more than `OVERHANG` is off the road.
 
-    Traffic that keeps to lanes: from the offset on its lane and the widths of that and the neighbour, not
-    counting what a body is wider than its lane. Free egos: every corner of the box, against the lane and
-    its neighbours, else against the nearest lane of the map and its neighbours. Shoulders are no road, and
-    in a junction only its lanes are; at the edge of the map the road is taken to go on. `free`: False is for
-    worlds without free egos, and compiles much faster.
+    The road is the lanes for motor traffic: shoulders do not count, and in a junction only its lanes do. At
+    the edge of the map the road is taken to go on. Traffic that keeps to lanes is checked by its offset and
+    the widths of its lane and the neighbour; a body wider than its lane does not count for that. Of free
+    egos every corner of the box is checked against the lane and its neighbours, then against the nearest
+    lane of the map and its neighbours.
+
+    Args:
+      lane_map: where.
+      state: the world.
+      box: `motion.boxes`.
+      free: False is for worlds without free egos, and compiles much faster.
     """
     half, own = state.shape.width / 2, width(lane_map, state.lane, state.s) / 2
     edge = jnp.maximum(own, half) + _beside(lane_map, state.lane, state.s, jnp.where(state.d > 0, 1, -1))
@@ -197,7 +207,7 @@ def off_road(
 
 
 def _beside(lane_map: LaneMap, lane: Array, s: Array, side: Array) -> Array:
-    """Width (m) of the neighbour on a side, 0 if there is none."""
+    """Width (m) of the lane on a side, 0 for none."""
     other = jnp.where(side > 0, lane_map.left[lane], lane_map.right[lane])
     return jnp.where(other != NO_LANE, width(lane_map, other, side_s(lane_map, lane, s, side)), 0)
 
@@ -230,7 +240,7 @@ def _section(lane_map: LaneMap, state: State) -> _Section:
 
 
 def _corner_off(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bool[Array, " E"]:
-    """Whether a corner of the box of each ego is off the road."""
+    """Whether a corner of each ego's box is off the road."""
     egos = state.egos
     body = lax.stop_gradient(box[egos.slot])
     corner = jax.vmap(box_corners)(body)  # [E, 4, 2]
@@ -267,15 +277,15 @@ def _corner_off(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bo
 
 
 def wrong_way(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bool[Array, " N"]:
-    """Free egos that point against the lanes on which their centre is, by more than 90 degrees.
+    """Free egos that point against their lanes, by more than 90 degrees.
 
-    Those lanes are the own one and its neighbours, or the oncoming one beside it. Off all of them no way is
-    wrong, and traffic that keeps to lanes is always right.
+    These are the lanes on which their centre is: the own one and its neighbours, or the oncoming one beside
+    it. Off all of them no direction is wrong, and traffic that keeps to lanes never drives the wrong way.
     """
     egos = state.egos
-    nobody = jnp.zeros_like(state.active)
+    none = jnp.zeros_like(state.active)
     if egos.slot.shape[0] == 0:
-        return nobody
+        return none
     x, y, heading = (lax.stop_gradient(box[egos.slot, k]) for k in range(3))
     d = state.d[egos.slot]
     road = _section(lane_map, state)
@@ -285,7 +295,7 @@ def wrong_way(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bool
     s, offset, _ = to_frenet(lane_map, oncoming, level, x, y)
     to_us = (oncoming != NO_LANE) & (jnp.abs(offset) <= width(lane_map, oncoming, s) / 2)
     along = jnp.cos(heading - road.heading) >= 0
-    return at_slots(egos, jnp.where(with_us, ~along, to_us & along), nobody, egos.free) & state.active
+    return at_slots(egos, jnp.where(with_us, ~along, to_us & along), none, egos.free) & state.active
 
 
 # ---- what has happened
@@ -294,12 +304,19 @@ def wrong_way(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bool
 def record(
     config: Config, lane_map: LaneMap, state: State, *, free: bool = True
 ) -> tuple[State, Bool[Array, " N"]]:
-    """Write down contacts, places off the road, wrong ways and broken numbers as of now.
+    """Record contacts, vehicles off the road, wrong ways and broken numbers.
 
-    Returns also who is off the road. `free`: False is for worlds without free egos.
+    Sets bits of `status`. `struck` and `struck_at` hold the first contact only, by slot: a vehicle that
+    enters there later is another one. No vehicle is moved or removed.
 
-    Sets bits of `status`; `struck` and `struck_at` tell of the first contact only, and of the slot: a
-    vehicle that enters there later is another one. Nobody is moved or removed.
+    Args:
+      config: of the run.
+      lane_map: where.
+      state: the world.
+      free: False is for worlds without free egos.
+
+    Returns:
+      The state, and the vehicles off the road.
     """
     box = computed_once(boxes(lane_map, state))
     touched = contacts(box, state.active, level(lane_map, state)).other
@@ -327,12 +344,12 @@ def record(
 
 
 def level(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
-    """Elevation of the road under every vehicle, m: who is on a bridge touches nobody below."""
+    """Elevation (m) of the road under every vehicle: above or below a bridge."""
     return elevation(lane_map, state.lane, state.s)[0]
 
 
 def collided(state: State) -> Bool[Array, ""]:
-    """Whether anybody on the road has touched another body."""
+    """Whether any vehicle on the road has touched another body."""
     return (state.active & ((state.status & int(Status.COLLIDED)) != 0)).any()
 
 
@@ -345,16 +362,18 @@ def after_collision(
     """Acceleration (m/s^2) of vehicles in view of the collisions they have had.
 
     Args:
-      state: who has collided.
-      a: what they would do otherwise; of all slots, or of those in `slot` (the control of egos).
-      option: "stop": who has collided brakes with `b_max` until it stands, and stays.
-      slot: whom `a` is for.
+      state: the world, which knows what has collided.
+      a: m/s^2, what vehicles do otherwise; of all slots, or of those in `slot` (the control of egos).
+      option: with "stop", collided vehicles brake with `b_max` until they stand, and stay.
+      slot: the slots that `a` is for.
 
     Raises:
       ValueError: unknown option.
     """
     if option not in get_args(AfterCollision):
-        raise ValueError(f"after a collision '{option}'? known are {', '.join(get_args(AfterCollision))}")
+        raise ValueError(
+            f"after_collision = '{option}' is unknown; known are {', '.join(get_args(AfterCollision))}"
+        )
     if option != "stop":
         return a
     status, b_max = (x if slot is None else x[slot] for x in (state.status, state.driver.b_max))

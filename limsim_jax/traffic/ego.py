@@ -1,10 +1,10 @@
-"""Vehicles under test: how they move in the plane, follow a trajectory, or take a meta-action.
+"""Vehicles under test: motion in the plane, trajectories, meta-actions.
 
 A free ego obeys the kinematic bicycle model. Its place is known twice, in the plane (`Egos`) and on a
 lane (its slot of `State`), so traffic and metrics see it like any other vehicle:
 
     free = step_free(config, lane_map, limits, state, control)
-    moved = advance(config, lane_map, state, jnp.where(is_free(state), free.a, a))  # everybody
+    moved = advance(config, lane_map, state, jnp.where(is_free(state), free.a, a))  # all vehicles
     state = with_free(moved, free)
 
 `State.s` is the front bumper along the lane and `State.d` the offset of the body's centre, at which
@@ -32,7 +32,7 @@ from limsim_jax.traffic.car_following import ballistic
 from limsim_jax.types import Config, Egos, State
 from limsim_jax.xla import interval
 
-_AGAINST = 3.5  # m: a lane is that much less fitting if the ego points against it
+_AGAINST = 3.5  # m: a lane fits worse by this much if the ego points against it
 _NOT_AT_ALL = 1e9  # m
 _WANTED = 1e-3  # m by which the lane that is ahead by the route wins over others that fit as well
 _LOST = 0.1  # m off all lanes around from which the lane is looked up in the whole map
@@ -45,7 +45,7 @@ _OVER_LINE = 0.1  # m of the body beyond the line from which the lane beside is 
 
 @struct.dataclass(frozen=True, kw_only=True)
 class Control:
-    """What a driver of free egos asks for; `Limits` say what becomes of it."""
+    """What a driver of free egos asks for; `Limits` say what it gets."""
 
     acceleration: Float[Array, " E"]  # m/s^2
     steering: Float[Array, " E"]  # rad, angle of the front wheels, left > 0
@@ -76,7 +76,7 @@ def step_free(config: Config, lane_map: LaneMap, limits: Limits, state: State, c
 
     Actuators follow the control with a first-order lag within their rates. The rear axle then runs along
     an arc, exact for the mean steering angle of the step: of radius wheelbase / tan(steering). Speed is
-    that of the rear axle; who brakes to a standstill stays there.
+    that of the rear axle; an ego that brakes to a standstill stays there.
 
     The lane is the one that the centre of the body is on: at its end the successor that it lies on (of
     several, the one of the route), beside it the neighbour beyond the line, past both the next of that by
@@ -137,7 +137,7 @@ def _follow(value: Array, command: Array, lag: Array | float, rate: Array | floa
 
 
 def _arc(heading: Array, distance: Array, bend: Array, wheelbase: Array) -> tuple[Array, Array, Array]:
-    """Displacement of the body's centre (m) and turn (rad) while the rear axle runs along an arc."""
+    """Displacement (m) of the centre and turn (rad) on an arc of the rear axle."""
     turn = bend * distance
     half = turn / 2
     small = jnp.abs(half) < 0.5
@@ -168,7 +168,10 @@ def body_place(
     s: Float[Array, "*e"],
     length: Array,
 ) -> tuple[Int[Array, "*e"], Float[Array, "*e"]]:
-    """Lane and arc length (m) of the centre of a body, half its length behind the front bumper at `s`."""
+    """Lane and arc length (m) of the centre of a body.
+
+    `s`: front bumper (m).
+    """
     s = s - length / 2
     behind = (s < 0) & (previous != NO_LANE)
     return jnp.where(behind, previous, lane), jnp.where(behind, s + lane_map.length[previous], s)
@@ -177,7 +180,7 @@ def body_place(
 def _find_lane(
     lane_map: LaneMap, state: State, x: Array, y: Array, heading: Array, distance: Array
 ) -> _Place:
-    """Where egos that were on lanes as `state` says are now, having driven `distance` m."""
+    """Places of egos now, `distance` m after those of `state`."""
     slot = state.egos.slot
     length, breadth = state.shape.length[slot], state.shape.width[slot]
     was, was_before, goal = state.lane[slot], state.previous[slot], state.goal[slot]
@@ -196,7 +199,7 @@ def _find_lane(
     lane, s = _anywhere(lane_map, lost, lane, s, here, onward, beside_s - lane_map.length[beside])
     s, d, along = to_frenet(lane_map, lane, s, x, y)
 
-    # The front bumper may be on the next lane already: that of before, else of the route, else any.
+    # The front bumper may be on the next lane already: the same as before, or of the route, or any.
     front = s + length / 2
     to_go = front - lane_map.length[lane]
     following, route = lane_map.successors[lane], lane_map.routes.next_lane[lane, goal]
@@ -224,9 +227,9 @@ def _find_lane(
 
 
 def _around(lane_map: LaneMap, lane: Array, s: Array) -> tuple[Array, Array]:
-    """Lanes on which a body near `s` (m) on `lane` can be: that one, beside it, past its nearer end.
+    """Lanes on which a body can be, and where on them (m); `[E, C]`.
 
-    And where on them, m; `[E, C]`.
+    It is near `s` (m) on `lane`: candidates are that lane, those beside it, and those past its nearer end.
     """
     before, after = lane_map.predecessors[lane], lane_map.successors[lane]
     count = max(before.shape[-1], after.shape[-1])
@@ -250,7 +253,7 @@ def _around(lane_map: LaneMap, lane: Array, s: Array) -> tuple[Array, Array]:
 
 
 def _misfit(lane_map: LaneMap, lanes: Array, guess: Array, here: tuple[Array, ...]) -> tuple[Array, Array]:
-    """How far a point is from being on each of its lanes `[E, C]`, m, and its arc length there."""
+    """Distance (m) from lanes `[E, C]`, and arc length (m) there."""
     x, y, heading = (_columns(value, lanes) for value in here)
     s, d, along = to_frenet(lane_map, lanes, guess, x, y)
     foot_x, foot_y, _ = pose(lane_map, lanes, s, d)
@@ -271,12 +274,13 @@ def _anywhere(
     onward: Int[Array, "E 2"],
     guess: Float[Array, "E 2"],
 ) -> tuple[Array, Array]:
-    """Look for the lane of those who are `lost` in the whole map; off all lanes they keep the last one.
+    """Look for the lane of `lost` egos in the whole map.
 
-    Who has crossed a line where the lanes end is on a lane `onward`, the next by the route from the lanes
-    beside, near `guess` m: where those part they overlap with others, and the nearest may lead elsewhere.
+    Off all lanes they keep the last one. An ego that has crossed a line where the lanes end is on a lane
+    `onward`, the next by the route from the lanes beside, near `guess` m. Where those part they overlap with
+    others, and the nearest may lead elsewhere.
 
-    A loop of at most one pass: it costs nothing while nobody is lost, in any world of a batch.
+    A loop of at most one pass: it costs nothing while no ego is lost, in any world of a batch.
     """
 
     def look(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -311,7 +315,7 @@ def _take(table: Array, column: Array) -> Array:
 def at_slots(
     egos: Egos, value: Shaped[Array, " E"], into: Shaped[Array, " N"], which: Bool[Array, " E"] | None = None
 ) -> Shaped[Array, " N"]:
-    """`into` with the values of the egos (those in `which`) in their slots."""
+    """Write values of the egos (in `which`) into their slots."""
     if egos.slot.shape[0] == 0:
         return into
     mine = egos.slot[:, None] == jnp.arange(into.shape[0], dtype=egos.slot.dtype)[None, :]
@@ -325,10 +329,10 @@ def is_free(state: State) -> Bool[Array, " N"]:
 
 
 def with_free(moved: State, free: State) -> State:
-    """The state after a step: `moved` for all other traffic, `free` (from `step_free`) for free egos.
+    """The state after a step: `free` for free egos, `moved` for all other traffic.
 
-    Who waits how long, and who braked too hard, is taken from `moved`, which should have been moved with
-    the acceleration of `free`. So is `step`.
+    `free` is from `step_free`. Waiting times, hard braking and `step` are taken from `moved`, which should
+    have been moved with the acceleration of `free`.
     """
     mine = is_free(free)
     own = "active", "lane", "previous", "s", "d", "v", "a", "side", "crossed", "progress", "shift", "distance"
@@ -370,9 +374,9 @@ def from_lane(
 
 
 def sync(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> State:
-    """Bring the Cartesian state of egos that keep to lanes up to date; `box`: `motion.boxes`.
+    """Update the Cartesian state of egos that keep to lanes.
 
-    Their wheels point along the lane, so an ego may be set free at any moment.
+    Their wheels point along the lane, so an ego may be set free at any moment. `box`: `motion.boxes`.
     """
     egos, slot = state.egos, state.egos.slot
     length, wheelbase = state.shape.length[slot], state.shape.wheelbase[slot]
@@ -396,7 +400,7 @@ def sync(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> State:
 
 
 def with_rows(egos: Egos, more: int) -> Egos:
-    """Egos and `more` rows that drive nobody yet: `assign` gives them vehicles."""
+    """Egos and `more` rows without a vehicle: `assign` gives them vehicles."""
     if not more:
         return egos
     pad = {name: jnp.zeros(more, getattr(egos, name).dtype) for name in ("free", "x", "y", "heading")}
@@ -405,22 +409,22 @@ def with_rows(egos: Egos, more: int) -> Egos:
 
 
 def assign(lane_map: LaneMap, state: State, box: Float[Array, "N 5"], slot: Int[Array, " E"]) -> State:
-    """Let the rows of `Egos` drive the vehicles in `slot`, -1 for nobody; `box`: `motion.boxes`.
+    """Let the rows of `Egos` drive these vehicles.
 
-    Who is taken starts in the plane where it is, at its speed and acceleration. Who is given back goes on
-    along its lane from where it is; off the middle it drifts back (`motion.advance`). Rows whose vehicle
-    stays are not touched.
+    A new vehicle starts in the plane where it is, at its speed and acceleration. A vehicle that is released
+    continues along its lane from where it is; off the middle it drifts back (`motion.advance`). Rows that
+    keep their vehicle are not touched. `slot`: -1 for none. `box`: `motion.boxes`.
     """
     egos = state.egos
     new = (slot != egos.slot) & (slot >= 0)
     taken = sync(lane_map, replace(state, egos=replace(egos, slot=slot, free=egos.free & ~new)), box).egos
     drives = jnp.where(new, True, egos.free & (slot == egos.slot)) & (slot >= 0)
     state = replace(state, egos=replace(taken, free=drives))
-    # a free body has no lane change in progress; who becomes one keeps no half of an old one
+    # a free body has no lane change in progress: a vehicle that becomes free gives its lane change up
     nothing = jnp.zeros_like(slot)
     side = at_slots(state.egos, nothing, state.side, new)
-    given = (egos.slot >= 0) & (egos.slot[:, None] != slot[None, :]).all(1) & egos.free
-    side = at_slots(egos, nothing, side, given)
+    released = (egos.slot >= 0) & (egos.slot[:, None] != slot[None, :]).all(1) & egos.free
+    side = at_slots(egos, nothing, side, released)
     return replace(state, side=side)
 
 
@@ -437,7 +441,7 @@ def arrived(lane_map: LaneMap, state: State) -> Bool[Array, " E"]:
 
 @struct.dataclass(frozen=True, kw_only=True)
 class Trajectory:
-    """Where the centre of each ego's body should be at `H` >= 2 moments.
+    """Places of the centres of the egos at `H` >= 2 moments.
 
     `heading` may be that of the body or of the path: only how it changes counts at driving speed.
     Between samples the path is straight: space them by 0.2 s or less in bends. Wheels are turned for a
@@ -452,7 +456,7 @@ class Trajectory:
     dt: float = struct.field(pytree_node=False, default=0.1)  # s between samples
 
     def at(self, time: Float[Array, " M"]) -> Float[Array, "E M 4"]:
-        """x, y (m), heading (rad, without jumps) and v (m/s) at these times (s).
+        """x, y (m), heading (rad, continuous), v (m/s) at these times (s).
 
         Linear between samples; before the first one as at it, beyond the last straight on at its speed.
         """
@@ -473,7 +477,7 @@ _LEAST_LOOK = 3.0  # m: ... but no less
 _SETTLE = 1.0  # s: the longitudinal error fades with this time constant
 _CLEAR = 0.5  # m: samples farther apart than that tell the direction of the path
 _CREEPING = 0.5  # m/s
-_LATE = 0.5  # m/s: a place that should be passed a second sooner or later counts as that much farther away
+_LATE = 0.5  # m/s: a place that is due a second sooner or later counts as this much farther away
 
 
 def track(
@@ -508,7 +512,7 @@ def track(
     look = jnp.maximum(v * _LOOK, _LEAST_LOOK)
     bend = _sample(trajectory, level + limits.steering_lag + config.dt / 2).bend
     bend = bend - 2 * error / look - offset / look**2
-    # who hardly moves turns the wheels as slowly: a path of nothing tells no direction
+    # an ego that hardly moves turns its wheels as slowly: a path without length has no direction
     present = 2 * jnp.sin(slip) / wheelbase
     bend = present + jnp.clip(here.v / _CREEPING, 0, 1) * (bend - present)
     # of the centre's path: sin(slip) = bend * wheelbase / 2, and tan(steering) = 2 tan(slip)
@@ -535,8 +539,8 @@ def _sample(trajectory: Trajectory, time: Float[Array, " E"]) -> _Sample:
 
     Its bend in the middle of a step between samples is the step's turn over its length; elsewhere it is
     that of a mixture of the two steps around, so that a step of hardly any length counts for as little.
-    If a step had the same bend all along, who looks a step ahead would still find that of now, and
-    planning anew at every step would never turn the wheels.
+    If a step had the same bend all along, a look one step ahead would still find the present bend, and
+    a planner that replans at every step would never turn the wheels.
     """
     dt, count = trajectory.dt, trajectory.x.shape[-1]
     steps = jnp.stack([jnp.diff(trajectory.x), jnp.diff(trajectory.y)], -1)
@@ -579,7 +583,7 @@ def _sample(trajectory: Trajectory, time: Float[Array, " E"]) -> _Sample:
 
 
 class Meta(enum.IntEnum):
-    """What an ego that keeps to lanes can be told to do until the next decision."""
+    """Commands to an ego that keeps to lanes, until the next decision."""
 
     KEEP = 0  # the speed
     ACCELERATE = 1
@@ -608,8 +612,8 @@ def meta_acceleration(
 def meta_lane(lane_map: LaneMap, state: State, meta: Int[Array, " E"]) -> Int[Array, " E"]:
     """Side of the lane change that a meta-action asks for: +1 left, -1 right, 0 none.
 
-    None where the marks or the kind of lane forbid it, in the midst of another change, and for free egos.
-    Whether there is room is not looked at.
+    0 where the marks or the kind of lane forbid it, during another change, and for free egos. Whether there
+    is room is not checked.
     """
     egos = state.egos
     lane, vehicle = state.lane[egos.slot], state.shape.vehicle_class[egos.slot]

@@ -1,7 +1,7 @@
-"""The traffic engine: look around and decide every so often, move in between.
+"""The traffic engine: decisions at intervals, and the motion in between.
 
-`decide` looks at the whole world once; everything discrete happens there, for all vehicles from the
-same state. `drive` then integrates `Config.decision_every` physics steps that need no look-ups.
+`decide` looks at the whole world once. Everything discrete happens there, for all vehicles from the same
+state. `drive` then integrates `Config.decision_every` physics steps, which need no look-ups.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.maps.lane_map import NO_LANE, LaneMap, bend_speed, curvature, room_beside
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, room_beside
 from limsim_jax.maps.routing import NO_ROOM
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
@@ -37,8 +37,8 @@ from limsim_jax.traffic.ego import (
     track,
     with_free,
 )
-from limsim_jax.traffic.lane_change import SLOWED, LaneChoice, choose_lane, place_beside, side_to_look, start
-from limsim_jax.traffic.motion import CREEP_SPEED, Decision, accelerations, advance, boxes, tails
+from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, side_to_look, start
+from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes, tails
 from limsim_jax.traffic.neighbors import (
     Ahead,
     Obstacles,
@@ -49,31 +49,17 @@ from limsim_jax.traffic.neighbors import (
     place_of,
     sort_vehicles,
 )
+from limsim_jax.traffic.parameters import DRIVING, LANE_CHANGES
 from limsim_jax.traffic.right_of_way import approaches_ahead, give_way
 from limsim_jax.traffic.signals import switch
+from limsim_jax.traffic.speeds import BEND_POINTS, bend_squares, lane_speed
 from limsim_jax.types import Config, Schedule, State, Status
 from limsim_jax.xla import computed_once, mapped_like
-
-PATIENCE = 20.0
-"""s of waiting at the end of a wrong lane before a driver gives up the route."""
-
-FAST = 25.0
-"""m/s, speed limit above which drivers do not wait for long at the end of a wrong lane."""
-
-AT_END = 40.0
-"""m from the end of a lane within which that counts."""
-
-_BEND_POINTS = 4  # places ahead on the own lane at which the bend is looked at
-_GENTLY, _FIRMLY = 2.5, 3.0  # m/s^2
-_IN_TIME = 0.9  # of the speed that would just do, as drivers come down to it by and by
-_LEFT = 2.0  # m beyond the end of a goal, within which who drives on is still in the way
-_WALL = 1.0  # m before the end of a lane that leads nowhere
-_WALL_ROOM = 25.0  # m before it, kept free to change lanes from a standstill
 
 
 @dataclass(frozen=True)
 class Traffic:
-    """Behaviour of the vehicles that nobody else controls, and what a collision leads to. All static."""
+    """Behaviour of the background traffic, and the effect of collisions. All static."""
 
     model: CarFollowing = field(default_factory=ACC)
     lane_changes: bool = True
@@ -84,22 +70,22 @@ class Traffic:
 
 @struct.dataclass(frozen=True, kw_only=True)
 class Command:
-    """What egos are told to do until the next decision; who is told nothing drives like the traffic.
+    """Commands for the egos until the next decision.
 
-    A free ego follows a trajectory or holds a control, else it rolls on with straight wheels; an ego that
-    keeps to lanes may take meta-actions.
+    An ego without a command is driven by the traffic model. A free ego follows a trajectory or holds a
+    control; without either it rolls on with straight wheels. An ego that keeps to lanes takes meta-actions.
     """
 
     trajectory: Trajectory | None = None
     control: Control | None = None
     meta: Int[Array, " E"] | None = None  # `Meta`, or -1: decide like the traffic
-    brake: Bool[Array, " N"] | None = None  # who brakes as hard as it can, egos or others
-    slot: Int[Array, " E"] | None = None  # whom each row of `Egos` drives from now on, -1: nobody
+    brake: Bool[Array, " N"] | None = None  # these vehicles, egos or others, brake as hard as they can
+    slot: Int[Array, " E"] | None = None  # that each row of `Egos` drives from now on, -1: none
     signal: Int[Array, " E"] | None = None  # turn signal of free egos: +1 left, -1 right; others make way
 
 
 class Tick(NamedTuple):
-    """What a physics step hands to whoever records."""
+    """What a physics step passes to the recorder."""
 
     state: State
     left: Bool[Array, " N"]  # has left at the end of its goal in this step
@@ -115,12 +101,23 @@ class Tick(NamedTuple):
 def decide(
     config: Config, traffic: Traffic, lane_map: LaneMap, state: State, command: Command
 ) -> tuple[State, Decision]:
-    """Look around once: leaders, right of way, lights, bends, lane changes. Starts lane changes."""
+    """Decide for all vehicles: leaders, right of way, lights, bends, lane changes.
+
+    Args:
+      config: of the run.
+      traffic: behaviour.
+      lane_map: where.
+      state: the world now.
+      command: of the egos.
+
+    Returns:
+      The state, with lights switched and lane changes started, and what was decided.
+    """
     state = _give_up(lane_map, state)
     order = sort_vehicles(lane_map, state)
     ahead = look_ahead(config, lane_map, state)
     v0, v_ahead, distance = _speeds(lane_map, state, ahead)
-    # changes to the left and to the right may start in turns, so nobody enters a gap from both sides
+    # changes to the left and to the right start in turns, so that no gap is entered from both sides
     turn = jnp.where((state.step // config.decision_every) % 2 == 0, 1, -1)
     side = side_to_look(lane_map, state, turn)
     beside, beside_s, allowed = place_beside(lane_map, state, side)
@@ -159,12 +156,14 @@ def decide(
     way = give_way(lane_map, state, approaches, own, lights)
     state = replace(state, lights=lights, yielding=way.yielding, stopped=way.stopped)
     end = _lane_end(lane_map, state, ahead)
-    # as far back as it can still stop for gently
-    end = jnp.maximum(end - choice.stops_before, jnp.minimum(end, state.v * state.v / (2 * _GENTLY)))
-    wall = jnp.minimum(end, way.stop + state.driver.s0)
+    # as far back as it can still stop gently
+    end = jnp.maximum(
+        end - choice.stops_before, jnp.minimum(end, state.v * state.v / (2 * DRIVING.gentle_braking))
+    )
+    stop_obstacle = jnp.minimum(end, way.stop + state.driver.s0)
     obstacles = Obstacles(
         jnp.stack([own.lead, second.lead, way.lead, jnp.full_like(own.lead, -1)], -1),
-        jnp.stack([own.lead_gap, second.lead_gap, way.lead_gap, wall], -1),
+        jnp.stack([own.lead_gap, second.lead_gap, way.lead_gap, stop_obstacle], -1),
     )
     return state, Decision(
         obstacles=obstacles,
@@ -177,21 +176,22 @@ def decide(
 
 
 def _give_up(lane_map: LaneMap, state: State) -> State:
-    """Who has waited `PATIENCE` s at the end of a lane that does not lead to the goal takes another goal.
+    """Give vehicles stuck at the end of a wrong lane another goal.
 
-    The nearest one that the lane does lead to, without another lane change if possible; recorded as
-    `Status.MISSED_ROUTE`. On fast roads (`FAST`) drivers give up after a quarter of that.
+    That is the nearest one that the lane does lead to, without another lane change if possible. It is
+    recorded as `Status.MISSED_ROUTE`. On fast roads drivers give up sooner.
     """
     routes = lane_map.routes
     leads_on = (routes.next_lane != NO_LANE) | routes.is_goal  # [L, G], the same for all worlds
     nearest = jnp.argmin(jnp.where(leads_on, routes.distance, jnp.inf), -1).astype(state.goal.dtype)
-    patience = jnp.where(lane_map.speed_limit[state.lane] > FAST, PATIENCE / 4, PATIENCE)
-    # who waits before a lane that is too short to wait on, or on it
+    fast = lane_map.speed_limit[state.lane] > DRIVING.fast_limit
+    patience = jnp.where(fast, DRIVING.fast_patience * DRIVING.patience, DRIVING.patience)
+    # a vehicle waits on the lane, or before it if the lane is too short to wait on
     after = routes.next_lane[state.lane, state.goal]
     before = (after != NO_LANE) & (lane_map.length[after] < NO_ROOM)
     lane = jnp.where(before, after, state.lane)
     to_end = lane_map.length[state.lane] - state.s
-    near = to_end < jnp.where(before, NO_ROOM, AT_END)
+    near = to_end < jnp.where(before, NO_ROOM, DRIVING.end_room)
     stuck = state.active & ~leads_on[lane, state.goal] & (state.waiting > patience) & near
     goal = nearest[lane]
     changes = stuck & leads_on.any(-1)[lane]
@@ -203,15 +203,15 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
 
 
 def _behind_tails(lane_map: LaneMap, state: State, ahead: Ahead, own: Pair) -> Pair:
-    """Leaders of those who come to the end of their way: also who has just left its last lane.
+    """Leaders of vehicles at the end of their route: also a vehicle that has just left the last lane.
 
-    All others see those on their way, or in a split of the ways.
+    All other vehicles see those on their route, or in a split of paths.
     """
     last = lane_map.routes.is_goal[ahead.lane, state.goal[:, None]] & (ahead.lane != NO_LANE)
     k = jnp.argmax(last, -1)[:, None]
     end, start = (jnp.take_along_axis(x, k, -1)[:, 0] for x in (ahead.lane, ahead.start))
     ends = last.any(-1)
-    lane, front = tails(lane_map, state, _LEFT)
+    lane, front = tails(lane_map, state, DRIVING.goal_room)
     rear = front - state.shape.length[:, None]
     out = lane_map.length.shape[0]
     lane = jnp.where(lane == NO_LANE, out, lane)
@@ -234,16 +234,17 @@ def _stay(state: State) -> LaneChoice:
 
 
 def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N"]:
-    """Metres to where the way ends before the goal: the end of a lane that the route does not leave."""
+    """Distance (m) to the end of the route before its goal: of a lane that leads elsewhere."""
     goal = state.goal[:, None]
     at_goal = lane_map.routes.is_goal[ahead.lane, goal]
     stuck = (lane_map.routes.next_lane[ahead.lane, goal] == NO_LANE) & ~at_goal & (ahead.lane != NO_LANE)
-    # who is on its way out may use the taper; others keep room to start from a standstill
-    stopping = (state.v * state.v / (2 * _FIRMLY))[:, None]
-    end = ahead.start + lane_map.length[ahead.lane] - _WALL
-    wide = ahead.start + lane_map.end_s[ahead.lane] - _WALL
-    # and where the lane is too short for that, nobody waits before it, on a lane that it would block
-    room = jnp.maximum(wide - (_WALL_ROOM - _WALL), ahead.start + lane_map.length[ahead.lane] / 2)
+    # a vehicle that changes lanes may use the taper; others keep room to start from a standstill
+    stopping = (state.v * state.v / (2 * DRIVING.end_braking))[:, None]
+    end = ahead.start + lane_map.length[ahead.lane] - DRIVING.end_gap
+    wide = ahead.start + lane_map.end_s[ahead.lane] - DRIVING.end_gap
+    # at most half of a short lane: no vehicle waits before it, on a lane that it would block
+    clear = DRIVING.end_clear - DRIVING.end_gap
+    room = jnp.maximum(wide - clear, ahead.start + lane_map.length[ahead.lane] / 2)
     end = jnp.where((state.side == 0)[:, None], jnp.where(room > stopping, room, wide), end)
     return jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
 
@@ -252,21 +253,20 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
 def _speeds(
     lane_map: LaneMap, state: State, ahead: Ahead
 ) -> tuple[Float[Array, " N"], Float[Array, " N"], Float[Array, " N"]]:
-    """Desired speed here, and the lower speed further on that asks for braking first, and how far it is."""
+    """Desired speed here (m/s), and a lower speed ahead with its distance.
+
+    Of all lower speeds ahead, the one that asks for braking first.
+    """
     driver = state.driver
     v0 = desired_speed(driver, lane_map.speed_limit[state.lane], curvature(lane_map, state.lane, state.s))
     v0 = jnp.minimum(v0, _until_changed(lane_map, state))
     # lanes to come: limit and tightest bend
-    lane = ahead.lane[:, 1:]
-    limit = driver.speed_factor[:, None] * lane_map.speed_limit[lane]
-    speed = jnp.minimum(limit, bend_speed(lane_map, lane, driver.a_lat[:, None]))
-    speed = jnp.where(lane == NO_LANE, NO_GAP, speed)
+    speed = lane_speed(lane_map, ahead.lane[:, 1:], driver.speed_factor[:, None], driver.a_lat[:, None])
     # the own lane: its bend at a few places within braking distance
-    reach = state.v * state.v / driver.b + 10.0
-    share = jnp.arange(1, _BEND_POINTS + 1, dtype=reach.dtype) / _BEND_POINTS
+    reach = state.v * state.v / driver.b + DRIVING.bend_room
+    share = jnp.arange(1, BEND_POINTS + 1, dtype=reach.dtype) / BEND_POINTS
     there = reach[:, None] * share[None, :]
-    bend = jnp.abs(curvature(lane_map, state.lane[:, None], state.s[:, None] + there))
-    own = jnp.sqrt(driver.a_lat[:, None] / jnp.maximum(bend, 1e-6))
+    own = jnp.sqrt(bend_squares(lane_map, driver, state.lane, state.s[:, None] + there))
     speed = jnp.concatenate([speed, own], -1)
     distance = jnp.maximum(jnp.concatenate([ahead.start[:, 1:], there], -1), 0)
     first = jnp.argmin(speed * speed + driver.b[:, None] * distance, -1)[:, None]
@@ -275,13 +275,16 @@ def _speeds(
 
 
 def _until_changed(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
-    """Speed that nobody who changes lanes exceeds, so that it is done before the two lanes part."""
+    """Speed (m/s) that finishes a lane change before the lanes part.
+
+    NO_GAP for vehicles that do not change lanes.
+    """
     other = jnp.where(state.crossed, -state.side, state.side)  # side of the other lane
     room = room_beside(lane_map, state.lane, state.s, other)
     time = jnp.maximum(state.driver.lane_change_time * (1 - state.progress), 0.1)
-    # who is much faster, as where somebody else has driven it, does not brake hard for that
-    least = jnp.maximum(SLOWED * state.v, CREEP_SPEED)
-    return jnp.where(state.side != 0, jnp.maximum(_IN_TIME * room / time, least), NO_GAP)
+    # a much faster vehicle, as one that a planner has driven, does not brake hard for that
+    least = jnp.maximum(LANE_CHANGES.slowed * state.v, LANE_CHANGES.creep_speed)
+    return jnp.where(state.side != 0, jnp.maximum(LANE_CHANGES.on_time * room / time, least), NO_GAP)
 
 
 @jax.named_scope("drive")
@@ -296,27 +299,32 @@ def drive(
     *,
     free: bool = True,
 ) -> tuple[State, Any]:
-    """One decision and the physics steps up to the next.
+    """Simulate one decision and the physics steps up to the next.
 
     Args:
       config: of the run.
       traffic: behaviour.
       lane_map: where.
       state: the world now.
-      schedule: who may enter; nobody if None.
+      schedule: vehicles that may enter; none if None.
       command: of the egos.
       record: its results are stacked over the steps, `[decision_every, ...]`.
       free: egos may leave their lanes; False is for worlds without free egos, and compiles faster.
+
+    Returns:
+      The state before the next decision, and the records.
 
     Raises:
       ValueError: an unknown `after_collision` or `look_for_contacts`.
     """
     if traffic.look_for_contacts not in ("step", "decision"):
-        raise ValueError(f"look for contacts every '{traffic.look_for_contacts}'? known are step, decision")
+        raise ValueError(
+            f"look_for_contacts = '{traffic.look_for_contacts}': unknown; known are step, decision"
+        )
     command = Command() if command is None else command
     if command.slot is not None:
         state = assign(lane_map, state, boxes(lane_map, state), command.slot)
-    if command.signal is not None:  # stands on both lanes for those who decide now
+    if command.signal is not None:  # then other vehicles see it on both lanes
         shows = state.egos.free & (command.signal != 0)
         state = replace(state, side=at_slots(state.egos, command.signal, state.side, shows))
     if schedule is not None:
@@ -357,7 +365,10 @@ def _step(
     command: Command,
     may_be_free: bool,
 ) -> tuple[State, Float[Array, " N"], Bool[Array, " N"], Bool[Array, " N"] | None]:
-    """One physics step, `x` m after the decision: the state, metres travelled, who has left, who is off."""
+    """One physics step, `x` m after the decision.
+
+    Returns the state, metres travelled, whether vehicles have left, and whether they are off the road.
+    """
     egos = state.egos
     a = accelerations(traffic.model, state, decision, x)
     if command.meta is not None:
@@ -395,8 +406,10 @@ def _step(
 
 
 def _ran_red(lane_map: LaneMap, state: State, before: State) -> State:
-    """Record who has crossed a stop line on red since the decision."""
+    """Record vehicles that have crossed a stop line on red."""
     red = lane_states(lane_map.signals, state.lights.phase) == SignalState.RED
-    ran = state.active & (state.lane != before.lane) & red[state.lane]  # nobody changes lanes behind a light
-    ran &= before.s <= lane_map.stop_s[before.lane] + 0.5  # who starts beyond the line does not cross it
+    ran = (
+        state.active & (state.lane != before.lane) & red[state.lane]
+    )  # there are no lane changes behind a light
+    ran &= before.s <= lane_map.stop_s[before.lane] + 0.5  # from beyond the line it is no crossing
     return replace(state, status=state.status | jnp.where(ran, int(Status.RED_LIGHT), 0))

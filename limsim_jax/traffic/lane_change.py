@@ -1,7 +1,8 @@
 """Lane changes: MOBIL for those that pay, urgency for those that the route needs.
 
 Kesting, Treiber, Helbing, Transp. Res. Rec. 1999 (2007) 86: eq. numbers below. Route term and courtesy
-are ours, after the lane-change bias of Treiber & Kesting, Traffic Flow Dynamics (2013), ch. 14.
+are ours, after the lane-change bias of Treiber & Kesting, Traffic Flow Dynamics (2013), ch. 14. The numbers
+are in `parameters.LaneChanging`.
 """
 
 from __future__ import annotations
@@ -15,55 +16,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, room_beside, side_s, width
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
-from limsim_jax.traffic.motion import CREEP_SPEED
 from limsim_jax.traffic.neighbors import Obstacles, Pair
+from limsim_jax.traffic.parameters import LANE_CHANGES
 from limsim_jax.types import State
 from limsim_jax.xla import computed_once
 
-ROUTE_BASE, ROUTE_URGENT = 0.5, 4.0
-"""m/s^2, incentive for a change that the route needs: at no, and at full urgency."""
-
-SAFE_URGENT = 3.0
-"""m/s^2, added to `b_safe` at full urgency."""
-
-CAUTION, EASE_OFF = 40.0, 1.0
-"""A driver wants to be done so many m before the last place to change, or for every lane to cross so far
-before it that slowing down with so many m/s^2 would do: who brakes for the end no longer fits into a gap."""
-
-COURTEOUS = 0.15
-"""Urgency from which a vehicle takes the pace of the other lane, and the follower there lets it in."""
-
-INTENT = 0.3
-"""Urgency from which a driver looks only where the route goes, and minds who needs the own lane."""
-
-SOON = 2.0
-"""s ahead, at which it counts who of two vehicles is behind."""
-
-SLOWED = 0.5
-"""Of its speed, to which a vehicle may slow down so that a lane change is done before the lanes part."""
-
-BEHIND = 2.5
-"""m left to the rear of a vehicle that changes to the own lane from a standstill."""
-
-REST = 4.0
-"""s from the end of a lane change to the start of the next voluntary one."""
-
-SLOWEST = 4.0
-"""m/s, speed assumed of a vehicle in a jam when it asks whether it could still change back."""
-
-HARDEST = 0.5
-"""Of `b_max`: no lane change may ask more braking of anybody, however urgent it is."""
-
-ROOM = 0.5
-"""m, least gap to the new leader and follower."""
-
 
 class LaneChoice(NamedTuple):
-    """What a vehicle would do about its lane, from the present state alone."""
+    """What a vehicle decides about its lane, from the present state alone."""
 
     side: Int[Array, " N"]  # +1 left, -1 right, 0 stay
-    courtesy: Obstacles  # whom each one lets in, and who is ahead on the lane that it has to get to
-    stops_before: Float[Array, " N"]  # m before the end of a wrong lane, to let another one out of its lane
+    courtesy: Obstacles  # the vehicle that each one lets in, and the leader on the lane that it has to reach
+    stops_before: Float[Array, " N"]  # m before the end of a wrong lane, so that another vehicle can leave it
 
 
 def urgency(
@@ -72,10 +36,17 @@ def urgency(
     v: Float[Array, " N"],
     lane_change_time: Float[Array, " N"],
 ) -> Float[Array, " N"]:
-    """How pressing a change of lanes for the route is, 0 to 1, `room` m before the last place for it."""
+    """Urgency of the lane changes that the route needs, 0 to 1.
+
+    Args:
+      lanes_to_go: lanes to cross, positive to the left.
+      room: m to the last place to change.
+      v: m/s.
+      lane_change_time: s.
+    """
     count = jnp.abs(lanes_to_go).astype(v.dtype)
-    way = count * (v * lane_change_time + 12.0)
-    spare = jnp.maximum(CAUTION, count * v * v / (2 * EASE_OFF))
+    way = count * (v * lane_change_time + LANE_CHANGES.change_room)
+    spare = jnp.maximum(LANE_CHANGES.caution, count * v * v / (2 * LANE_CHANGES.ease_off))
     pressing = jnp.clip((way + spare - room) / jnp.maximum(way, 1.0), 0, 1)
     return jnp.where(lanes_to_go != 0, pressing, 0)
 
@@ -101,24 +72,28 @@ def incentive(
 def closing(
     v: Float[Array, " N"], v_lead: Float[Array, " N"], a_lead: Float[Array, " N"], gap: Float[Array, " N"]
 ) -> Float[Array, " N"]:
-    """Braking, m/s^2, that brings `v` down to the leader's speed within the gap, if that brakes on as now."""
+    """Braking (m/s^2) down to the leader's speed within the gap.
+
+    The leader is taken to go on braking as now. Speeds in m/s, `a_lead` in m/s^2, `gap` in m.
+    """
     faster = jnp.maximum(v - v_lead, 0)
     slows = jnp.where(faster > 0, jnp.maximum(-a_lead, 0), 0)
-    return faster * faster / (2 * jnp.maximum(gap, ROOM)) + slows
+    return faster * faster / (2 * jnp.maximum(gap, LANE_CHANGES.room)) + slows
 
 
 def side_to_look(lane_map: LaneMap, state: State, turn: Int[Array, ""]) -> Int[Array, " N"]:
-    """Where every vehicle looks for a place at this decision: +1 left, -1 right.
+    """The side on which every vehicle looks for a gap: +1 left, -1 right.
 
-    Sides take turns, but who must change lanes soon keeps looking where it has to go, so that whoever lets
-    it in goes on to do so.
+    Sides take turns. A vehicle that must change lanes soon keeps looking where it has to go, so that the
+    vehicle that lets it in goes on to do so.
     """
-    press = _pressing(lane_map, state)
+    press = _urgency(lane_map, state)
     to_go = lane_map.routes.lanes_to_go[state.lane, state.goal]
-    return jnp.where(press > INTENT, jnp.sign(to_go), turn)
+    return jnp.where(press > LANE_CHANGES.intent, jnp.sign(to_go), turn)
 
 
-def _pressing(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
+def _urgency(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
+    """Urgency of every vehicle; the taper at the end of a lane does not count as room."""
     to_go = lane_map.routes.lanes_to_go[state.lane, state.goal]
     taper = (lane_map.length - lane_map.end_s)[state.lane]
     room = lane_map.routes.change_distance[state.lane, state.goal] - taper - state.s
@@ -128,20 +103,28 @@ def _pressing(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
 def place_beside(
     lane_map: LaneMap, state: State, side: Int[Array, " N"]
 ) -> tuple[Int[Array, " N"], Float[Array, " N"], Bool[Array, " N"]]:
-    """Lane and s (m) on the side (+1 left, -1 right) of every vehicle, and whether it may change there.
+    """The place beside every vehicle, and whether it may change there.
 
-    NO_LANE where it may not: by road marks, in junctions, by vehicle class, in the midst of a change, or
-    too late to finish before the lanes part.
+    It may not where road marks forbid it, in junctions, by vehicle class, during another change, or too
+    late to finish before the lanes part.
+
+    Args:
+      lane_map: where.
+      state: the world.
+      side: +1 left, -1 right.
+
+    Returns:
+      The lane, NO_LANE where the vehicle may not change; s (m) on it; and whether the vehicle may change.
     """
     left = side > 0
     lane = jnp.where(left, lane_map.left[state.lane], lane_map.right[state.lane])
     allowed = jnp.where(left, lane_map.may_change_left[state.lane], lane_map.may_change_right[state.lane])
     usable = ((lane_map.access[lane] >> state.shape.vehicle_class) & 1) == 1
     allowed &= usable & state.active & (state.side == 0) & ~lane_map.is_connector[state.lane]
-    # time to finish before the lanes part, braking with two thirds of b if need be
+    # time to finish before the lanes part: mean speed while braking with two thirds of b
     time = state.driver.lane_change_time
-    mean = jnp.maximum(state.v - state.driver.b * time / 3, SLOWED * state.v)
-    needed = jnp.maximum(mean, CREEP_SPEED) * time
+    mean = jnp.maximum(state.v - state.driver.b * time / 3, LANE_CHANGES.slowed * state.v)
+    needed = jnp.maximum(mean, LANE_CHANGES.creep_speed) * time
     allowed &= room_beside(lane_map, state.lane, state.s, side) > needed
     lane = jnp.where(allowed, lane, NO_LANE)
     return lane, side_s(lane_map, state.lane, state.s, side), allowed
@@ -161,27 +144,39 @@ def choose_lane(
     side: Int[Array, " N"],
     turn: Int[Array, ""],
 ) -> LaneChoice:
-    """The lane change to `side` that each vehicle wants and may start now, if it is the turn of that side.
+    """The lane change that each vehicle wants and may start now.
 
-    `own` and `pair` are the neighbours on the own lane and on `lane` beside it, level with `s` m. All
-    vehicles choose from the same state. Two that enter the same gap come from the same lane and keep
+    All vehicles choose from the same state. Two that enter the same gap come from the same lane and keep
     the distance that they have.
+
+    Args:
+      model: car following.
+      lane_map: where.
+      state: the world.
+      v0: m/s, desired speeds.
+      own: neighbours on the own lane.
+      pair: neighbours on the lane beside.
+      lane: beside every vehicle, from `place_beside`.
+      s: m along that lane.
+      allowed: whether the vehicle may change to it.
+      side: of that lane, +1 left, -1 right.
+      turn: the side to which changes may start at this decision.
     """
     driver, shape = state.driver, state.shape
     me = jnp.arange(state.lane.shape[0], dtype=jnp.int32)
     routes = lane_map.routes
     to_go = routes.lanes_to_go[state.lane, state.goal]
-    press = computed_once(_pressing(lane_map, state))
+    press = computed_once(_urgency(lane_map, state))
     wanted = jnp.sign(to_go)
     reachable = routes.reachable[lane, state.goal]
-    # a lane on the wanted side may still lead nowhere: the change may be possible only further on
+    # a lane on the wanted side may be the wrong one: the change may be possible only further on
     farther = routes.distance[lane, state.goal] > routes.distance[state.lane, state.goal]
     back_to_go = routes.lanes_to_go[lane, state.goal]
     back = routes.change_distance[lane, state.goal] - s
     found = wanted, reachable, farther, back_to_go, back
     wanted, reachable, farther, back_to_go, back = computed_once(found)
 
-    # six accelerations in one call: who (i) follows whom (j, -1: free road) at what gap
+    # six accelerations in one call: vehicle i follows vehicle j (-1: free road) at a gap
     between = pair.lag_gap + shape.length + pair.lead_gap  # from the new follower to the new leader
     around = own.lag_gap + shape.length + own.lead_gap
     cases = [
@@ -194,11 +189,11 @@ def choose_lane(
     ]
     i, j, gap = (jnp.stack(column) for column in zip(*cases, strict=True))
     free = j < 0
-    who, v = jax.tree.map(lambda x: x[i], driver), state.v[i]
+    follows, v = jax.tree.map(lambda x: x[i], driver), state.v[i]
     v_lead, a_lead = jnp.where(free, v, state.v[j]), jnp.where(free, 0, state.a[j])
     gap = jnp.where(free, NO_GAP, gap)
-    who, gap, v, v_lead, a_lead, v_free = computed_once((who, gap, v, v_lead, a_lead, v0[i]))
-    accelerations = computed_once(model(who, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free))
+    follows, gap, v, v_lead, a_lead, v_free = computed_once((follows, gap, v, v_lead, a_lead, v0[i]))
+    accelerations = computed_once(model(follows, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free))
     own_now, own_then, new_now, new_then, old_now, old_then = (accelerations[k] for k in range(6))
     follower, old = pair.lag >= 0, own.lag >= 0
     advantage = incentive(
@@ -212,31 +207,33 @@ def choose_lane(
     )
     towards = (wanted == side) & ~farther
     with_route = jnp.where(towards, 1, jnp.where(wanted * side < 0, -1, 0)).astype(advantage.dtype)
-    advantage += with_route * (ROUTE_BASE + ROUTE_URGENT * press)
+    advantage += with_route * (LANE_CHANGES.route_base + LANE_CHANGES.route_urgent * press)
     advantage -= side.astype(advantage.dtype) * driver.keep_right
     advantage = computed_once(advantage)
 
-    # safety (eq. 2): nobody has to brake harder than b_safe, and there is room
-    b_safe = driver.b_safe + SAFE_URGENT * press
+    # safety (eq. 2): no vehicle has to brake harder than b_safe, and there is room
+    room = LANE_CHANGES.room
+    b_safe = driver.b_safe + LANE_CHANGES.safe_urgent * press
     # the models are mild where a cut-in leaves a short gap; what the speeds ask for must not be hard either
-    b_lag, b_own = (HARDEST * jnp.where(i[k] < 0, 0, driver.b_max[i[k]]) for k in (3, 1))
+    b_lag, b_own = (LANE_CHANGES.hardest * jnp.where(i[k] < 0, 0, driver.b_max[i[k]]) for k in (3, 1))
     need_lag, need_own = (closing(v[k], v_lead[k], a_lead[k], gap[k]) for k in (3, 1))
-    safe = (~follower | ((new_then > -b_safe) & (need_lag < b_lag) & (pair.lag_gap > ROOM))) & (
-        (pair.lead < 0) | ((own_then > -b_safe) & (need_own < b_own) & (pair.lead_gap > ROOM))
+    safe = (~follower | ((new_then > -b_safe) & (need_lag < b_lag) & (pair.lag_gap > room))) & (
+        (pair.lead < 0) | ((own_then > -b_safe) & (need_own < b_own) & (pair.lead_gap > room))
     )
-    # a change away from the route must leave time to come back, and none is begun that the lane cannot hold
+    # a change away from the route must leave time to come back
     away = (wanted * side < 0) | ((wanted == side) & farther) | ((wanted == 0) & (back_to_go != 0))
     count = jnp.abs(back_to_go).astype(back.dtype)
-    late = away & (back < 3 * jnp.maximum(state.v, SLOWEST) * driver.lane_change_time * (count + 1))
+    speed = jnp.maximum(state.v, LANE_CHANGES.jam_speed)
+    late = away & (back < LANE_CHANGES.return_factor * speed * driver.lane_change_time * (count + 1))
     rested = (state.rest <= 0) | (press > 0)
     starts = allowed & reachable & safe & ~late & rested & (advantage > driver.threshold) & (side == turn)
 
-    asks = towards & (press > COURTEOUS) & allowed & ~starts
+    asks = towards & (press > LANE_CHANGES.courteous) & allowed & ~starts
     starts, asks = computed_once((starts, asks))
 
-    # courtesy: who is in need takes the pace of the lane that it has to get to, and falls behind who is
-    # abreast; the vehicle that would be its new follower lets it in: who starts is its leader from the next
-    # decision on
+    # Courtesy: a vehicle that needs the other lane takes its pace, and falls behind a vehicle abreast. The
+    # one that would be its new follower lets it in, also while it starts: from the next decision on it is
+    # the leader there.
     n = me.shape[0]
     minds = (asks | (starts & towards)) & follower
     letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(minds, pair.lag, n)].max(me)[:n]
@@ -247,24 +244,24 @@ def choose_lane(
         jnp.stack([jnp.where(lets, letting_gap, NO_GAP), jnp.where(asks, pair.lead_gap, NO_GAP)], -1),
     )
 
-    # of two abreast that need each other's lanes the one that will be behind stops behind the other: else
-    # both wait at the ends of their lanes for good
-    lead = (pair.lead >= 0) & (pair.lead_gap < ROOM)
-    abreast = jnp.where(lead, pair.lead, jnp.where(pair.lag_gap < ROOM, pair.lag, -1))
+    # Of two vehicles abreast that need each other's lanes, the one that will be behind stops behind the
+    # other. Otherwise both would wait at the ends of their lanes for good.
+    lead = (pair.lead >= 0) & (pair.lead_gap < room)
+    abreast = jnp.where(lead, pair.lead, jnp.where(pair.lag_gap < room, pair.lag, -1))
     ahead = jnp.where(lead, pair.lead_gap + shape.length[pair.lead], -pair.lag_gap - shape.length)
-    ahead += SOON * (state.v[abreast] - state.v)
+    ahead += LANE_CHANGES.abreast_time * (state.v[abreast] - state.v)
     behind = (ahead > 0) | ((ahead == 0) & (me > abreast))
-    swaps = towards & (press > INTENT) & (abreast >= 0) & behind
+    swaps = towards & (press > LANE_CHANGES.intent) & (abreast >= 0) & behind
     swaps &= (wanted[abreast] == -wanted) & (press[abreast] > 0)
     return LaneChoice(
         side=jnp.where(starts, side, 0),
         courtesy=courtesy,
-        stops_before=jnp.where(swaps, shape.length[abreast] + BEHIND, 0),
+        stops_before=jnp.where(swaps, shape.length[abreast] + LANE_CHANGES.behind_room, 0),
     )
 
 
 def start(lane_map: LaneMap, state: State, choice: LaneChoice) -> State:
-    """Begin the lane changes that were chosen."""
+    """Start the lane changes that were chosen."""
     begins = choice.side != 0
     beside = jnp.where(choice.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
     s_beside = side_s(lane_map, state.lane, state.s, choice.side)
@@ -276,5 +273,5 @@ def start(lane_map: LaneMap, state: State, choice: LaneChoice) -> State:
         crossed=state.crossed & ~begins,
         progress=jnp.where(begins, 0, state.progress),
         shift=jnp.where(begins, shift, state.shift),
-        rest=jnp.where(begins, REST + state.driver.lane_change_time, state.rest),
+        rest=jnp.where(begins, LANE_CHANGES.rest + state.driver.lane_change_time, state.rest),
     )

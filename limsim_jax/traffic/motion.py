@@ -20,21 +20,13 @@ from limsim_jax.numerics import safe_divide
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing, ballistic
 from limsim_jax.traffic.ego import overlay_boxes
 from limsim_jax.traffic.neighbors import Obstacles
+from limsim_jax.traffic.parameters import DRIVING, LANE_CHANGES
 from limsim_jax.types import Config, State, Status
 from limsim_jax.xla import column_min, computed_once
 
-WALKING_SPEED = 1.5
-"""m/s, below which a vehicle counts as waiting."""
-
-CREEP_SPEED = 5.0
-"""m/s, below which a lane change goes on by distance, not by time: what stands does not slide."""
-
-_STEEPEST = math.tan(0.2)  # way against the lane in a lane change: the ends of long bodies stay near theirs
-_DRIFT = 0.5  # m/s back to the middle of the lane
+_STEEPEST = math.tan(LANE_CHANGES.steepest)
 _GOAL = -2  # in place of the next lane, at the end of a goal
 _HAND_OVERS = 3  # lanes that a vehicle may leave behind in one step
-_BUMPER, _HALT = 0.4, 2.5  # m beyond the place to stop, still before the line; m/s^2 used there
-_APPROACH = 0.7  # of the comfortable deceleration: used to slow down for a bend ahead
 
 
 class Decision(NamedTuple):
@@ -44,19 +36,22 @@ class Decision(NamedTuple):
     v0: Float[Array, " N"]  # m/s, desired speed here
     v_ahead: Float[Array, " N"]  # m/s, lower speed needed further on
     ahead: Float[Array, " N"]  # m to there, at the decision
-    courtesy: Obstacles  # who is let in, and behind whom a place is looked for
+    courtesy: Obstacles  # the vehicle that is let in, and the one behind which a gap is looked for
     lanes: Int[Array, "N D"]  # the lanes that it drives on next, its own first
-
-
-COURTESY = 2.0
-"""m/s^2, the hardest braking to let somebody in, or to find a place on the next lane."""
 
 
 @jax.named_scope("accelerations")
 def accelerations(
     model: CarFollowing, state: State, decision: Decision, x: Float[Array, " N"]
 ) -> Float[Array, " N"]:
-    """Acceleration (m/s^2) of every vehicle, `x` m after the decision: the least that any obstacle asks."""
+    """Acceleration (m/s^2) of every vehicle: the least that any obstacle asks.
+
+    Args:
+      model: car following.
+      state: the world.
+      decision: the last one.
+      x: m travelled since then.
+    """
     driver = state.driver
     index, gap0 = (x.T for x in decision.obstacles)  # vehicles last: XLA vectorises along their axis
     moving = index >= 0
@@ -64,31 +59,31 @@ def accelerations(
     def seen(index: Int[Array, "*b"], value: Float[Array, " N"]) -> Float[Array, "*b"]:
         return jnp.where(index >= 0, value[index], 0)
 
-    none = (gap0 >= NO_GAP) | (moving & ~state.active[index])  # who leaves the map is no obstacle
+    none = (gap0 >= NO_GAP) | (moving & ~state.active[index])  # a vehicle that leaves the map is no obstacle
     gap = jnp.where(none, NO_GAP, gap0 + seen(index, x) - x[None])
     v_lead = jnp.where(none, state.v[None], seen(index, state.v))
     a_lead = jnp.where(moving, seen(index, state.a), 0)
     gap, v_lead, a_lead = computed_once((gap, v_lead, a_lead))
-    # slow down in time for what comes: the speed from which `v_ahead` is reached with a part of b
+    # the speed from which `v_ahead` is reached with a share of b
     room = jnp.maximum(decision.ahead - x, 0)
-    reach = jnp.sqrt(decision.v_ahead**2 + 2 * _APPROACH * driver.b * room + 1e-6)
+    reach = jnp.sqrt(decision.v_ahead**2 + 2 * DRIVING.bend_braking * driver.b * room + 1e-6)
     v0 = jnp.minimum(decision.v0, reach)
     each, v, v_free = jax.tree.map(lambda value: value[None], (driver, state.v, v0))
     a = column_min(model(each, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free))
-    # the models only lag behind a desired speed that falls: who is above it brakes as hard as that takes
+    # the models lag behind a desired speed that falls: a vehicle above it brakes as hard as that takes
     need = (state.v * state.v - decision.v_ahead**2) / (2 * jnp.maximum(room, 0.5))
     a = jnp.where(state.v > reach, jnp.minimum(a, -jnp.clip(need, 0, driver.b)), a)
-    # the models roll on slowly within s0: who is about to stand at a line stops before it
-    line = jnp.where(index < 0, gap, NO_GAP).min(0) - driver.s0 + _BUMPER
+    # the models roll on slowly within s0: a vehicle that comes to stand at a line stops before it
+    line = jnp.where(index < 0, gap, NO_GAP).min(0) - driver.s0 + DRIVING.line_room
     need = state.v * state.v / (2 * jnp.maximum(line, 0.02))
-    rolls = (state.v < WALKING_SPEED) & (line < 1.0) & (need > 0.5)
-    a = jnp.where(rolls, jnp.minimum(a, -jnp.minimum(need, _HALT)), a)
+    rolls = (state.v < DRIVING.walking_speed) & (line < DRIVING.line_near) & (need > DRIVING.line_braking)
+    a = jnp.where(rolls, jnp.minimum(a, -jnp.minimum(need, DRIVING.line_hardest)), a)
     index, gap0 = (x.T for x in decision.courtesy)
     minds = (index >= 0) & state.active[index]
     gap = jnp.where(minds, gap0 + seen(index, x) - x[None], NO_GAP)
     v_lead = jnp.where(minds, seen(index, state.v), state.v[None])
     kind = column_min(model(each, gap=gap, v=v, v_lead=v_lead, a_lead=jnp.zeros_like(gap), v0=v_free))
-    return jnp.minimum(a, jnp.maximum(kind, -COURTESY))
+    return jnp.minimum(a, jnp.maximum(kind, -LANE_CHANGES.courtesy_braking))
 
 
 @jax.named_scope("advance")
@@ -100,7 +95,8 @@ def advance(
 ) -> tuple[State, Float[Array, " N"], Bool[Array, " N"]]:
     """Move all vehicles one step with acceleration `a` (m/s^2).
 
-    Returns the state, the distance that each travelled (m), and who has left at the end of its goal.
+    Returns:
+      The state, the distance that each travelled (m), and whether it has left at the end of its goal.
     """
     a = jnp.where(state.active, a, 0)
     v, dx = computed_once(ballistic(state.v, a, config.dt))
@@ -116,7 +112,7 @@ def advance(
         a=jnp.where(left, 0, realised),
         active=state.active & ~left,
         distance=state.distance + dx,
-        waiting=jnp.where(state.active & (v < WALKING_SPEED), state.waiting + config.dt, 0),
+        waiting=jnp.where(state.active & (v < DRIVING.walking_speed), state.waiting + config.dt, 0),
         rest=jnp.maximum(state.rest - config.dt, 0),
         status=state.status | jnp.where(hard & state.active, int(Status.HARD_BRAKE), 0),
     )
@@ -126,7 +122,7 @@ def advance(
 def _hand_over(
     lane_map: LaneMap, state: State, s: Float[Array, " N"]
 ) -> tuple[Int[Array, " N"], Int[Array, " N"], Float[Array, " N"], Bool[Array, " N"]]:
-    """Pass vehicles beyond the end of their lane on to the next one of their route."""
+    """Move vehicles beyond the end of their lane to the next lane."""
     routes = lane_map.routes
     way = jnp.where(routes.is_goal, _GOAL, routes.next_lane)  # one look-up instead of two
     lane, previous = state.lane, state.previous
@@ -146,13 +142,13 @@ def _hand_over(
 
 
 def smooth_step(u: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """The quintic from 0 to 1 with zero first and second derivative at both ends."""
+    """Quintic from 0 to 1; its first two derivatives vanish at both ends."""
     u = jnp.clip(u, 0, 1)
     return u * u * u * (10 + u * (-15 + 6 * u))
 
 
 def _turn_back(lane_map: LaneMap, state: State) -> State:
-    """Who changes to a lane that does not go on beside the own one returns to the middle of the own lane."""
+    """Return to the own lane if the other lane ends."""
     beside = jnp.where(state.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
     lost = state.active & (state.side != 0) & ~state.crossed & (beside == NO_LANE)
     return replace(
@@ -166,14 +162,14 @@ def _turn_back(lane_map: LaneMap, state: State) -> State:
 
 @jax.named_scope("lane_change_motion")
 def _move_sideways(config: Config, lane_map: LaneMap, state: State) -> State:
-    """Go on with lane changes: d follows a quintic, and half-way the lane is the other one."""
+    """Continue lane changes: d follows a quintic; half-way the lane becomes the other one."""
     state = _turn_back(lane_map, state)
     changing = state.active & (state.side != 0)
-    rate = jnp.minimum(state.v / CREEP_SPEED, 1)
+    rate = jnp.minimum(state.v / LANE_CHANGES.creep_speed, 1)
     done = state.progress + rate * safe_divide(jnp.full_like(rate, config.dt), state.driver.lane_change_time)
     progress = jnp.where(changing, jnp.minimum(done, 1), 0)
-    # who is off the middle without changing lanes, as after somebody else has driven it, drifts back
-    drift = jnp.sign(state.d) * jnp.maximum(jnp.abs(state.d) - _DRIFT * rate * config.dt, 0)
+    # a vehicle off the middle without a lane change, as after a planner has driven it, drifts back
+    drift = jnp.sign(state.d) * jnp.maximum(jnp.abs(state.d) - LANE_CHANGES.drift * rate * config.dt, 0)
     offset = state.shift * (1 - smooth_step(progress))  # from the centre of the lane that it moves to
     beside = jnp.where(state.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
     s_beside = side_s(lane_map, state.lane, state.s, state.side)
@@ -208,22 +204,28 @@ def _move_sideways(config: Config, lane_map: LaneMap, state: State) -> State:
 
 
 def lateral_speed(state: State) -> Float[Array, " N"]:
-    """Speed across the lane, m/s, of vehicles that change lanes."""
+    """Speed across the lane (m/s) of vehicles that change lanes."""
     u = jnp.clip(state.progress, 0, 1)
     slope = 30 * u * u * (1 - u) * (1 - u)
-    rate = safe_divide(jnp.minimum(state.v / CREEP_SPEED, 1), state.driver.lane_change_time)
+    rate = safe_divide(jnp.minimum(state.v / LANE_CHANGES.creep_speed, 1), state.driver.lane_change_time)
     return jnp.where(state.side != 0, -state.shift * slope * rate, 0)
 
 
 def tails(
     lane_map: LaneMap, state: State, beyond: float = 0.0
 ) -> tuple[Int[Array, "N 2"], Float[Array, "N 2"]]:
-    """Lanes behind its own on which a vehicle still has its tail, and its front bumper along them, m.
+    """Lanes behind its own on which a vehicle still has its tail.
 
-    A tail so far `beyond` (m) the end of a lane counts as on it.
+    Lanes may be shorter than vehicles, so these are the lane behind and the one behind that. Where several
+    lanes lead there, it is not known from which of them the vehicle came.
 
-    NO_LANE where it has none. Lanes may be shorter than vehicles, so these are the lane behind and the one
-    behind that; where several lead there, it is not known from which of them a vehicle came.
+    Args:
+      lane_map: where.
+      state: the world.
+      beyond: m past the end of a lane, up to which a tail counts as on it.
+
+    Returns:
+      The lanes, NO_LANE where there is no tail, and the front bumper along them (m).
     """
     one = (lane_map.predecessors != NO_LANE).sum(-1) == 1
     behind = jnp.where(one[state.previous], lane_map.predecessors[state.previous, 0], NO_LANE)

@@ -1,4 +1,4 @@
-"""Who drives ahead and behind, on the own lane and beside it, across lane ends along the route.
+"""Leaders and followers: on the own lane, beside it, across lane ends.
 
 One sort per decision puts all vehicles in order of (lane, s); every query is then a binary search.
 A vehicle that changes lanes stands in the order twice, once on each lane.
@@ -20,7 +20,7 @@ from limsim_jax.xla import computed_once
 
 _POSITION_BITS = 18  # of a sort key, at most: positions on a lane to 1 / 2^18 of its length
 _FEWEST_BITS = 14  # with fewer left for the position, the number of the entry stays out of the key
-_OVER_LINE = 0.3  # m of room that a body which leaves a lane keeps to those who stay there
+_OVER_LINE = 0.3  # m of room that a body which leaves a lane keeps to the traffic that stays there
 _UPSTREAM = 2  # predecessors of a lane that are searched for followers
 
 
@@ -32,10 +32,10 @@ class Ahead(NamedTuple):
 
 
 class Obstacles(NamedTuple):
-    """What a vehicle must not run into: `K` others or standing obstacles, gaps at the decision."""
+    """Obstacles of every vehicle, `K` of them: others, or stop obstacles, with gaps."""
 
-    other: Int[Array, "N K"]  # slot of the other vehicle, -1 for a standing obstacle
-    gap: Float[Array, "N K"]  # m, bumper to bumper; NO_GAP if there is none
+    other: Int[Array, "N K"]  # slot of the other vehicle, -1 for a stop obstacle
+    gap: Float[Array, "N K"]  # m at the decision, bumper to bumper; NO_GAP if there is none
 
 
 class Pair(NamedTuple):
@@ -63,7 +63,7 @@ class Order(NamedTuple):
 
 
 class SortKeys:
-    """Puts entries in order of row and position, and finds places among them.
+    """Sorts entries by row and position, and finds places among them.
 
     Sorting one word that holds row, position and number of the entry is several times as fast as sorting
     pairs; pairs are sorted where 32 bits are too few.
@@ -110,9 +110,9 @@ class SortKeys:
 def _coming(
     config: Config, lane_map: LaneMap, state: State, ahead: Ahead, lane: Int[Array, "*b"]
 ) -> tuple[Int[Array, "*b"], Float[Array, "*b"]]:
-    """The next vehicle that comes to each lane over at least one other lane, and m from it to the lane.
+    """The next vehicle that comes to each lane over another lane.
 
-    -1 where nobody comes within `config.look_ahead`.
+    -1 where none comes within `config.look_ahead`. Also returns m from it to the lane.
     """
     size, n = lane_map.length.shape[0], state.lane.shape[0]
     # one word that holds distance and slot, so that one scatter and one gather find both
@@ -123,24 +123,31 @@ def _coming(
     word = (jnp.clip(start, 0, config.look_ahead) / unit).astype(jnp.uint32) << slot_bits
     word |= jnp.arange(n, dtype=jnp.uint32)[:, None]
     way, word = computed_once((jnp.where(seen, way, size), word))
-    nobody = jnp.uint32(2**32 - 1)
-    first = computed_once(jnp.full(size, nobody).at[way].min(word, mode="drop")[lane])
+    none = jnp.uint32(2**32 - 1)
+    first = computed_once(jnp.full(size, none).at[way].min(word, mode="drop")[lane])
     slot: Array = (first & (2**slot_bits - 1)).astype(jnp.int32)
-    return jnp.where(first < nobody, slot, -1), (first >> slot_bits).astype(jnp.float32) * unit
+    return jnp.where(first < none, slot, -1), (first >> slot_bits).astype(jnp.float32) * unit
 
 
 def lanes_ahead(config: Config, lane_map: LaneMap) -> int:
-    """How many lanes beyond the own one everybody looks at: more on maps of short lanes."""
+    """Number of lanes ahead that are looked at: more on maps of short lanes."""
     return max(config.look_ahead_lanes, lane_map.lanes_in_sight)
 
 
 @jax.named_scope("look_ahead")
 def look_ahead(config: Config, lane_map: LaneMap, state: State) -> Ahead:
     """Follow the route of every vehicle over `lanes_ahead` lanes beyond its own."""
-    lanes, starts = [state.lane], [-state.s]
+    return follow_routes(config, lane_map, state.lane, state.s, state.goal)
+
+
+def follow_routes(
+    config: Config, lane_map: LaneMap, lane: Int[Array, " N"], s: Float[Array, " N"], goal: Int[Array, " N"]
+) -> Ahead:
+    """The first lanes on routes from `s` (m) of `lane` to `goal`."""
+    lanes, starts = [lane], [-s]
     for _ in range(lanes_ahead(config, lane_map)):
         starts.append(starts[-1] + lane_map.length[lanes[-1]])
-        lanes.append(lane_map.routes.next_lane[lanes[-1], state.goal])
+        lanes.append(lane_map.routes.next_lane[lanes[-1], goal])
     return Ahead(jnp.stack(lanes, -1), jnp.stack(starts, -1))
 
 
@@ -171,9 +178,10 @@ def sort_vehicles(lane_map: LaneMap, state: State) -> Order:
 
 
 def other_lane(lane_map: LaneMap, state: State) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
-    """The second lane that a vehicle which changes lanes is on, else NO_LANE, and its s there (m).
+    """The other lane of vehicles that change lanes, and s there (m).
 
-    That is the lane it moves to from the start on, and the one it comes from as long as its body is there.
+    NO_LANE for all others. From the start it is the lane that the vehicle moves to, then the one that it
+    comes from as long as its body is there.
     """
     side = jnp.where(state.crossed, -state.side, state.side)
     lane = jnp.where(side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
@@ -186,7 +194,7 @@ def other_lane(lane_map: LaneMap, state: State) -> tuple[Int[Array, " N"], Float
 def place_of(
     order: Order, lane_map: LaneMap, lane: Int[Array, "*b"], s: Float[Array, "*b"]
 ) -> Int[Array, "*b"]:
-    """Place in the order of the first entry beyond `s` (m) on `lane`: a binary search."""
+    """Place of the first entry beyond `s` (m) on `lane`."""
     sorting = SortKeys(lane_map.length.shape[0], order.key.shape[0])
     return sorting.first_beyond(order.key, sorting.key(lane, s / lane_map.length[lane]))
 
@@ -213,14 +221,22 @@ def neighbors(
     here: Int[Array, "N K"],
     ahead: Ahead | None = None,
 ) -> Pair:
-    """Leaders and followers of every vehicle as if it stood at `s` (m) of `lane`, for K places each.
+    """Leaders and followers of every vehicle at K places each.
 
-    `here` is the place of the first entry beyond it: `place_of`, or for a vehicle where it is, its own
-    `rank` + 1.
+    The leader is looked for along the route from there, within `config.look_ahead`. The follower is the
+    next vehicle behind on the lane. If there is none, it is the nearest of the first vehicles on two
+    predecessors and, given `ahead`, of the vehicles that come from farther back. The vehicle itself does
+    not count. Without a lane there are no neighbours.
 
-    The leader is looked for along the route from there, within `config.look_ahead`; the follower on the
-    lane, else it is the nearest of the first on each of two predecessors and, given the ways `ahead` of all,
-    of those who come from farther back. The vehicle itself does not count. Without a lane there is nobody.
+    Args:
+      config: of the run.
+      lane_map: where.
+      order: of all vehicles.
+      state: the world.
+      lane: of the places.
+      s: m along it.
+      here: place in the order of the first entry beyond: `place_of`, or `rank` + 1 where a vehicle is.
+      ahead: routes of all vehicles.
     """
     # vehicles last: their axis is the long one, along which XLA vectorises
     lane, s, here = lane.T, s.T, here.T
@@ -241,7 +257,7 @@ def neighbors(
     behind = jnp.stack([lane_map.predecessors[lane, k] for k in range(_UPSTREAM)])  # [P, K, N]
     first, last = order.first[on], order.last[behind]
 
-    # leader: the next entry that is not oneself, else the last vehicle of the lanes that follow
+    # leader: the next entry that is not the vehicle itself, or the last vehicle of the following lanes
     vehicle, position = _entry(order, here, lane)
     vehicle2, position2 = _entry(order, here + 1, lane)
     skip = vehicle == me
@@ -259,7 +275,7 @@ def neighbors(
     lead_gap = lead_at - length[lead]
     lead = jnp.where(lead_gap < config.look_ahead, lead, -1)
 
-    # follower: the entry before, else the first vehicle on a lane that leads here
+    # follower: the entry before, or the first vehicle on a lane that leads here
     vehicle, position = _entry(order, here - 1, lane)
     vehicle2, position2 = _entry(order, here - 2, lane)
     skip = vehicle == me

@@ -91,7 +91,7 @@ class Junctions:
         3.0,
         "s",
         "waiting time of both vehicles after which right before left no longer holds",
-        "chosen: long enough to see who starts",
+        "chosen: long enough to see which vehicle starts",
         (1.0, 10.0),
     )
     priority_time: float = _number(

@@ -3,7 +3,7 @@
 JSON: for each parameter of `vehicles.PARAMETERS` in `parameters` its median, spread, and bounds, in the units
 and with the meaning of `vehicles.Population`, and in `correlation` the matrix of the correlations of their
 scores, in the order of `parameters`. They hold for the vehicle classes in `classes`; other classes, and other
-parameters of these, stay as `vehicles.DEFAULTS` say. What else is in the file is for its readers.
+parameters of these, stay as `vehicles.DEFAULTS` say. Anything else in the file is ignored.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ def start_state(
     active: Bool[Array, " N"] | None = None,
     origins: int = 0,
 ) -> State:
-    """A world at its first moment: vehicles in the middle of their lanes, nobody changing lanes.
+    """A world at its first moment: vehicles in the middle of their lanes.
 
     Args:
       lane_map: where.
@@ -75,7 +75,7 @@ def start_state(
 
 
 def no_egos() -> Egos:
-    """Nobody is under test."""
+    """Egos of a world without any."""
     none = jnp.zeros(0, jnp.float32)
     return Egos(
         slot=jnp.zeros(0, jnp.int32),

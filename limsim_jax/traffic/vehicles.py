@@ -1,4 +1,4 @@
-"""Who is on the road: vehicle classes, their sizes and limits, and drivers from cautious to aggressive.
+"""Vehicles and drivers: classes, sizes, limits, and driving from cautious to aggressive.
 
 A `Population` is a mixture of types. Within a type every parameter has a truncated log-normal
 distribution (`speed_factor` and `svo`: normal), and a Gaussian copula joins them: two standard normal
@@ -367,22 +367,22 @@ def uniform_population(vehicle_class: str = "car", **parameters: float) -> Popul
 
 
 SWEEP = 0.6
-"""m, by how much a body may stand out of its path in the tightest bend of a map, see `restrict_to_map`."""
+"""m that a body may stand out of its path in the tightest bend of a map, see `restrict_to_map`."""
 
 
 RARE_BENDS = 50
-"""One lane in so many does not count in `restrict_to_map`."""
+"""Number of lanes of which one does not count in `restrict_to_map`."""
 
 CAR = 5.0
 """m, length up to which a vehicle fits everywhere."""
 
 
 def restrict_to_map(population: Population, lane_map: LaneMap) -> Population:
-    """The population without types that are too long for the bends of a map.
+    """Leave out vehicle types too long for the bends of a map.
 
     In a bend of curvature kappa the ends of a body of length l stand out by kappa l^2 / 8. On most urban
-    junctions that leaves trucks and buses no room beside traffic in the next lane; they are drawn no more.
-    A lane in `RARE_BENDS` may be as tight as it likes, and cars drive everywhere.
+    junctions that leaves trucks and buses no room beside traffic in the next lane, so they get no share.
+    One lane in `RARE_BENDS` may be tighter. Cars drive everywhere.
 
     Raises:
       ValueError: none fits.
@@ -403,11 +403,11 @@ def refit(
     rows: Mapping[str, tuple[float, float, float, float]],
     factor: NDArray[np.float64],
 ) -> Population:
-    """A population some parameters of which have another, joint distribution, see `population_file`.
+    """Replace the joint distribution of some parameters, see `population_file`.
 
     Args:
       population: one type per class.
-      classes: whom it concerns.
+      classes: of the types that change.
       rows: median, spread, lower and upper bound per parameter.
       factor: lower triangular root of the correlation of their scores, in the order of `rows`.
     """
@@ -432,13 +432,13 @@ def refit(
 
 
 def from_vtypes(types: Sequence[VehicleType]) -> Population:
-    """SUMO's vehicle types, one row each in the given order, with their probabilities as shares.
+    """SUMO's vehicle types as a population, in the given order.
 
-    What a vType gives is the same for all its vehicles but for the speed factor, which is drawn. `tau`,
-    `minGap`, `accel`, `decel`, `emergencyDecel`, `maxSpeed` become T, s0, a, b, b_max, v_max whatever the
-    car-following model; `sigma` is ignored, for these models know no such imperfection. The wheelbase
-    goes with the length. All else (lane changes, bends, gaps at junctions) is distributed as `DEFAULTS`
-    say for the class.
+    Shares are their probabilities. What a vType gives is the same for all its vehicles, except the speed
+    factor, which is drawn. `tau`, `minGap`, `accel`, `decel`, `emergencyDecel`, `maxSpeed` become T, s0, a,
+    b, b_max, v_max whatever the car-following model. `sigma` is ignored, because these models have no such
+    imperfection. The wheelbase scales with the length. Lane changes, bends and gaps at junctions are
+    distributed as `DEFAULTS` say for the class.
 
     Raises:
       MapError: there are no types, one is of no motor vehicle, or no probability is positive.

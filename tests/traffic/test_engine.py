@@ -15,9 +15,10 @@ from limsim_jax.maps.lane_map import curvature, lane_rows, width
 from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.traffic.car_following import ACC, IDM
 from limsim_jax.traffic.ego import from_lane
-from limsim_jax.traffic.engine import PATIENCE, Traffic, _give_up, drive
+from limsim_jax.traffic.engine import Traffic, _give_up, drive
 from limsim_jax.traffic.lane_change import closing, incentive, urgency
 from limsim_jax.traffic.motion import boxes, smooth_step
+from limsim_jax.traffic.parameters import DRIVING
 from limsim_jax.types import Config, Status
 
 CONFIG = Config(dt=0.1)
@@ -353,7 +354,9 @@ def test_who_waits_before_a_wrong_lane_too_short_to_wait_on_takes_another_goal()
     rows, lane_map = lane_rows(map_), build_lane_map(map_, goals=[["left"], ["right"]])
     s = [199.5, 180.0, 199.5, 1.0]
     state = state_of("ramp", [rows["a"]] * 3 + [rows["p0"]], s, [0.0] * 4, [0] * 4)
-    waiting = jnp.asarray([PATIENCE + 1, PATIENCE + 1, PATIENCE - 1, PATIENCE + 1], jnp.float32)
+    waiting = jnp.asarray(
+        [DRIVING.patience + 1, DRIVING.patience + 1, DRIVING.patience - 1, DRIVING.patience + 1], jnp.float32
+    )
     after = _give_up(lane_map, dataclasses.replace(state, waiting=waiting))
     np.testing.assert_array_equal(after.goal, [1, 0, 0, 1])
     np.testing.assert_array_equal((after.status & int(Status.MISSED_ROUTE)) > 0, [True, False, False, True])

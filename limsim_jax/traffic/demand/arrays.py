@@ -1,4 +1,4 @@
-"""What the device gets of a demand, and of the egos."""
+"""Demand and egos as the device gets them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from limsim_jax.traffic.vehicles import Population
 from limsim_jax.types import Driver, Shape
 
 NEVER = 1e9
-"""s, time of the rows of a schedule that nobody uses."""
+"""s, time of unused rows of a schedule."""
 
 FLOW_BITS = 16  # of the number that keys a draw: the flow or the place in the queue; above: the lane
 
@@ -55,16 +55,16 @@ class Demand:
 
 @struct.dataclass(frozen=True, kw_only=True)
 class EgoStart:
-    """Where vehicles under test begin, `E` of them; they take the first slots.
+    """Start of the vehicles under test, `E` of them; they take the first slots.
 
-    Without a lane they take the places, goals and speeds of others that would be there at the start, so
-    every world has them elsewhere.
+    Without a lane they take the places, goals and speeds of other vehicles at the start, so that they start
+    elsewhere in every world.
     """
 
     lane: Int[Array, " E"] | None = None
     s: Float[Array, " E"] | None = None  # m, front bumper
     goal: Int[Array, " E"] | None = None  # column of the route table
-    v: Float[Array, " E"] | None = None  # m/s, where road and leader allow it; None: as fast as they do
+    v: Float[Array, " E"] | None = None  # m/s, at most what road and leader allow; None: just that
     driver: Driver  # [E]
     shape: Shape  # [E]
     free: Bool[Array, " E"]  # moves in the plane, not on lanes
@@ -76,5 +76,5 @@ class EgoStart:
 
 
 def draw_number(row: int, part: int) -> int:
-    """Number that keys the draws of flow or place `part` on lane `row`."""
+    """Number that keys draws: of a flow or a place (`part`) on a lane (`row`)."""
     return (row << FLOW_BITS) + part

@@ -1,4 +1,4 @@
-"""Flows and a density on the host become a `Demand`, arrays for the device."""
+"""From flows and a density to a `Demand` for the device."""
 
 from __future__ import annotations
 
@@ -36,30 +36,30 @@ def build_demand(
     vehicles: int | None = None,
     egos: EgoStart | None = None,
 ) -> Demand:
-    """Check flows and density, and lay them out for `sample_scenario`.
+    """Check flows and density, and lay them out for the device.
 
     Args:
       network: the map.
       lane_map: of that map and these goals.
       goals: lane ids by name, in the order of the columns of `lane_map.routes`
         (`maps.routing.default_goals` if the map was built without any).
-      flows: who comes later. Several may use one lane; they share its queue.
-      population: whom to draw from.
-      horizon: s; nobody comes after it.
+      flows: vehicles that enter later. Several flows may use one lane; they share its queue.
+      population: from which vehicles are drawn.
+      horizon: s; no vehicle enters after it.
       density: vehicles at the start per km of lane outside junctions.
       vehicles: instead of that, how many there are at the start.
-      egos: vehicles under test; nobody else starts on top of them, nor within `EGO_ROOM` on their lanes.
+      egos: vehicles under test; no other vehicle starts within `EGO_ROOM` on their lanes, or touches them.
 
     Raises:
-      ValueError: an origin or goal that is not there or not reachable, a number that makes no sense, a
-        lane that is open to none of the vehicles, or a density that does not fit; one line that says which.
+      ValueError: an unknown or unreachable origin or goal, a number out of range, a lane that is open to
+        none of the vehicles, or a density that does not fit; one line that says which.
     """
     if not 0 < horizon < math.inf:
         raise ValueError(f"horizon = {horizon:g} s; it has to be positive and finite")
     if not 0 <= density < math.inf:
         raise ValueError(f"density = {density:g} veh/km; it has to be 0 or more, and finite")
     if vehicles is not None and vehicles < 0:
-        raise ValueError(f"{vehicles} vehicles at the start? 0 or more")
+        raise ValueError(f"vehicles = {vehicles}; it has to be 0 or more")
     tables = Tables.of(network, lane_map, goals, population)
     streams: list[Stream] = []
     for i, flow in enumerate(flows):

@@ -14,31 +14,32 @@ from limsim_jax.maps.lane_map import (
 )
 from limsim_jax.traffic.car_following import safe_speed
 from limsim_jax.traffic.motion import tails
-from limsim_jax.traffic.neighbors import lanes_ahead, look_ahead, other_lane
+from limsim_jax.traffic.neighbors import follow_routes, look_ahead, other_lane
 from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config, Queues, Schedule, State
 
 AT_ONCE = 16
 """Departures that a decision looks at, at most."""
 
-_REAR_ROOM = 1.0  # m, least gap to the follower of who enters
-_FAR = 1e6  # m, of who is not there
-_NOWHERE = -2  # lane of who is not there: not even the null lane
+_REAR_ROOM = 1.0  # m, least gap between a vehicle that enters and its follower
+_FAR = 1e6  # m, distance of empty slots
+_NOWHERE = -2  # lane of empty slots: not even the null lane
 
 
 @jax.named_scope("enter")
 def enter(config: Config, lane_map: LaneMap, schedule: Schedule, state: State) -> State:
-    """Let the first of every queue in whose time has come, if there is room and a free slot.
+    """Let due vehicles enter, if there is room and a free slot.
 
-    Call it once per decision, before `decide` looks around. Room is there if the leader, on the departure
-    lane or along the route beyond it, leaves a gap of s0 + v T at the smaller of the speeds of both, and
-    followers who come along their routes need not brake with more than b. The entry speed is at most
-    `schedule.v` and `safe_speed`. Headways are not rounded to decisions: who could have entered since the
-    last one stands further on accordingly. Who finds no room waits; who finds room but no slot is counted
-    in `queues.full`, once per decision. Slots of egos stay free.
+    Call it once per decision, before `decide`. The first vehicle of every queue enters if there is room for
+    it. The leader, on the departure lane or along the route beyond it, must leave a gap of s0 + v T at the
+    smaller of both speeds, and followers along their routes must not need to brake with more than b. The
+    entry speed is at most `schedule.v` and `safe_speed`. Headways are not rounded to decisions: a vehicle
+    that could have entered since the last decision starts further on accordingly. Without room a vehicle
+    waits; with room but without a slot it is counted in `queues.full`, once per decision. Slots of egos stay
+    free.
 
-    Origins go in turn: when slots are short, when two would enter right behind one another, and when
-    more than `AT_ONCE` have somebody whose time has come.
+    Origins take turns when slots are short, when two vehicles would enter right behind one another, and when
+    more than `AT_ONCE` origins have a vehicle that is due.
     """
     n, origins = state.lane.shape[0], state.queues.next.shape[0]
     if not origins:
@@ -47,7 +48,7 @@ def enter(config: Config, lane_map: LaneMap, schedule: Schedule, state: State) -
     row = jnp.minimum(state.queues.next, schedule.time.shape[0] - 1)
     due = (state.queues.next < schedule.start[1:]) & (schedule.time[row] <= now)
 
-    # those `P` that are due and next in turn
+    # the `P` vehicles that are due and next in turn
     number = jnp.arange(origins, dtype=jnp.int32)
     turn = (number + AT_ONCE * (state.step // config.decision_every)) % origins
     count = jnp.cumsum(due[turn], dtype=jnp.int32)
@@ -55,12 +56,12 @@ def enter(config: Config, lane_map: LaneMap, schedule: Schedule, state: State) -
     origin = turn[jnp.minimum(jnp.searchsorted(count, place), origins - 1)]
     row = row[origin]
     lane, s = schedule.lane[row], schedule.s[row]
-    ahead, start = _lanes_ahead(config, lane_map, lane, s, schedule.goal[row])
+    ahead, start = follow_routes(config, lane_map, lane, s, schedule.goal[row])
     late = jnp.minimum(now - schedule.time[row], config.decision_time)
     room, shift, v = _room_ahead(config, lane_map, schedule, state, row, ahead, start, late)
     ready = (place <= count[-1]) & room & _room_behind(config, lane_map, schedule, state, row, v)
 
-    # of those that would enter close to one another the first in turn
+    # of vehicles that would enter close to one another, the first in turn
     meet = (ahead[:, :, None] == lane[None, None]).any(1)
     meet = (meet | meet.T) & (place[None] < place[:, None])
     ready &= ~(meet & ready[None]).any(1)
@@ -102,7 +103,7 @@ def enter(config: Config, lane_map: LaneMap, schedule: Schedule, state: State) -
 
 
 def delayed(schedule: Schedule, state: State, t: Float[Array, ""] | float) -> Int[Array, " O"]:
-    """Vehicles per origin whose time has come at `t` (s) and that have not entered."""
+    """Vehicles per origin that are due at `t` (s) and still wait."""
     row = jnp.arange(schedule.time.shape[0], dtype=jnp.int32)
     waits = (
         (row[None] >= state.queues.next[:, None])
@@ -110,17 +111,6 @@ def delayed(schedule: Schedule, state: State, t: Float[Array, ""] | float) -> In
         & (schedule.time <= t)[None]
     )
     return jnp.sum(waits, 1, dtype=jnp.int32)
-
-
-def _lanes_ahead(
-    config: Config, lane_map: LaneMap, lane: Int[Array, " P"], s: Float[Array, " P"], goal: Int[Array, " P"]
-) -> tuple[Int[Array, "P D"], Float[Array, "P D"]]:
-    """Lanes from the departure lane on, and m from the front bumper to their starts."""
-    lanes, starts = [lane], [-s]
-    for _ in range(lanes_ahead(config, lane_map)):
-        starts.append(starts[-1] + lane_map.length[lanes[-1]])
-        lanes.append(lane_map.routes.next_lane[lanes[-1], goal])
-    return jnp.stack(lanes, -1), jnp.stack(starts, -1)
 
 
 def _room_ahead(
@@ -133,9 +123,12 @@ def _room_ahead(
     start: Float[Array, "P D"],
     late: Float[Array, " P"],
 ) -> tuple[Bool[Array, " P"], Float[Array, " P"], Float[Array, " P"]]:
-    """Whether leaders leave enough room; how far (m) beyond its place a vehicle enters, and how fast (m/s).
+    """Room to the leaders: whether, where and how fast a vehicle enters.
 
-    It stands where it would be now had it entered up to `late` s ago, as far as leaders let it.
+    It starts where it would be now had it entered up to `late` s ago, as far as leaders let it.
+
+    Returns:
+      Whether there is room, m beyond its place, and m/s.
     """
     gap = jnp.full((row.shape[0], state.lane.shape[0]), _FAR)  # m to the rear of every vehicle
     # every vehicle on its lane, on the other one if it changes lanes, and on those that its tail is on
@@ -167,7 +160,7 @@ def _room_behind(
     row: Int[Array, " P"],
     v: Float[Array, " P"],
 ) -> Bool[Array, " P"]:
-    """Whether those who come from behind can follow a vehicle that enters at `v` (m/s)."""
+    """Whether vehicles from behind can follow one that enters at `v` (m/s)."""
     driver = state.driver
     ahead = look_ahead(config, lane_map, state)
     other, other_s = other_lane(lane_map, state)

@@ -1,4 +1,4 @@
-"""Flows: what the user says, and the streams of vehicles per departure lane that come of it."""
+"""Flows of the user, and their streams of vehicles per departure lane."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _PATTERNS = ("poisson", "uniform", "platoon")
 class Flow:
     """Vehicles from one or several origins.
 
-    The flow of an origin is spread over its lanes: to every goal evenly over those from which it can be
-    reached with room to change lanes, `CHANGE_ROOM` and `CHANGE_TIME` (or, if there are none, those with
-    the fewest lanes to cross), in proportion to the share of vehicles that may use the lane.
+    The flow of an origin is spread over its lanes. Vehicles to a goal use those lanes evenly from which they
+    can reach it with room to change lanes (`CHANGE_ROOM` and `CHANGE_TIME`), or if there are none, those with
+    the fewest lanes to cross. A lane gets traffic in proportion to the share of vehicles that may use it.
 
-    Patterns, each independent on every lane: `poisson`: exponential headways. `uniform`: equal headways
-    from a random phase. `platoon`: groups of `platoon` vehicles `headway` s apart, between the groups
-    an exponential time on top of that.
+    Patterns, independent on every lane: `poisson` has exponential headways. `uniform` has equal headways from
+    a random phase. `platoon` has groups of `platoon` vehicles `headway` s apart, and between the groups an
+    exponential time on top of that.
     """
 
     origin: str | Sequence[str]
@@ -42,7 +42,7 @@ class Flow:
     rate: float
     """Vehicles per hour, of each origin."""
     goal: str | Mapping[str, float] | None = None
-    """Name of a goal, or shares by name (turning ratios); None: all that can be reached, in equal shares."""
+    """Name of a goal, or shares by name (turning ratios); None: all reachable goals in equal shares."""
     pattern: str = "poisson"
     begin: float = 0.0
     """s"""
@@ -88,7 +88,9 @@ class Stream:
             object.__setattr__(self, name, value)
 
     def capacity(self) -> int:
-        """Rows that suffice but for a chance of `RARE`, and one more: if the last is taken, more may come.
+        """Rows that suffice but for a chance of `RARE`, and one more.
+
+        If the last one is taken, the schedule may be too short.
 
         `k` groups take `k size headway` s and a gamma-distributed time.
         """
@@ -247,7 +249,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _spread(tables: Tables, rows: list[int], goal: int, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shares of the lanes of an origin in its traffic to a goal."""
+    """Shares of the lanes of an origin in traffic to one goal."""
     usable = tables.reachable[rows, goal] & (weight > 0)
     easy = usable & tables.leaves_room(rows, np.full(len(rows), tables.lengths[1]))[:, goal]
     if not easy.any():

@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from limsim_jax.maps.lane_map import (
     NO_LANE,
     LaneMap,
-    bend_speed,
     curvature,
 )
 from limsim_jax.numerics import safe_sqrt
@@ -25,16 +24,16 @@ from limsim_jax.traffic.demand.arrays import FLOW_BITS, NEVER, Demand, EgoStart
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.neighbors import neighbors, sort_vehicles
+from limsim_jax.traffic.speeds import BEND_POINTS, bend_squares, lane_speed
 from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import BODY, PARAMETERS, Population, sample_vehicles
 from limsim_jax.types import Config, Driver, Queues, Scenario, Schedule, Shape, State
 
-_WALL_ROOM = 12.0  # m before the end of a lane that leads nowhere, kept free to change lanes
+_DEAD_END_ROOM = 12.0  # m before the end of a lane that leads nowhere, kept free to change lanes
 _LOOK = 4  # lanes ahead of the departure lane that limit the speed
-_BEND_POINTS = 4  # places on the departure lane at which the bend is looked at
 _LOOK_CONFIG = Config(dt=0.1)  # how far vehicles at the start look for their leaders; only that counts
 _SWEEPS = 8  # times that the speeds at the start are adjusted to those of the leaders
-_FAR = 1e6  # m, of who is not there
+_FAR = 1e6  # m, where there is none
 
 # Purposes of keys.
 _ARRIVALS, _SEATS, _ROLES, _VEHICLES = range(4)
@@ -43,7 +42,7 @@ _ARRIVALS, _SEATS, _ROLES, _VEHICLES = range(4)
 def sample_scenario(
     demand: Demand, lane_map: LaneMap, key: Key[Array, ""], slots: int, egos: EgoStart | None = None
 ) -> Scenario:
-    """Draw one world: who is there at the start, and who comes later.
+    """Draw one world: the vehicles at the start, and those that enter later.
 
     Args:
       demand: from `build_demand`.
@@ -63,7 +62,7 @@ def sample_scenario(
         raise ValueError(f"{initial} vehicles at the start do not fit into {slots} slots")
     time, lane, place, stream = _sample_queues(demand, key)
     seat, shift = _sample_seats(demand, key)
-    # those of the queues first, then those in the seats
+    # vehicles of the queues first, then those in the seats
     number = jnp.concatenate([(lane << FLOW_BITS) + place, -1 - seat])
     goals = jnp.concatenate([demand.goals[stream], demand.seat_goals[seat]])
     types = jnp.concatenate([demand.types[stream], demand.seat_types[seat]])
@@ -98,21 +97,22 @@ def sample_scenario(
 
 
 def _with_egos(lane_map: LaneMap, egos: EgoStart, others: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Driver, shape, lane, s, v and goal of who is there at the start, egos first."""
+    """Put egos before the other vehicles at the start."""
     _, _, lane, s, _, goal = jax.tree.map(lambda x: x[: egos.count], others)
     rest = jax.tree.map(lambda x: x[egos.count :], others)
     if egos.lane is not None and egos.s is not None and egos.goal is not None:
         lane, s, goal, rest = egos.lane, egos.s, egos.goal, others
     v = entry_speed(lane_map, egos.driver, lane, s, goal)
     v = v if egos.v is None else jnp.minimum(egos.v, v)
-    them = egos.driver, egos.shape, lane, s, v, goal
-    return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), them, rest)
+    first = egos.driver, egos.shape, lane, s, v, goal
+    return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), first, rest)
 
 
 def overflow(demand: Demand, key: Key[Array, ""]) -> Bool[Array, ""]:
-    """Whether more vehicles come in this world than the schedule has rows for (the host should raise).
+    """Whether more vehicles enter than the schedule has rows for.
 
-    The chance is `RARE` per flow and lane, unless rates were changed after `build_demand`.
+    The host should raise then. The chance is `RARE` per flow and lane, unless rates were changed after
+    `build_demand`.
     """
     time = _sample_arrivals(demand, key)
     last = jnp.take_along_axis(time, demand.capacity[:, None] - 1, 1)[:, 0]
@@ -120,16 +120,17 @@ def overflow(demand: Demand, key: Key[Array, ""]) -> Bool[Array, ""]:
 
 
 def _sample_arrivals(demand: Demand, key: Key[Array, ""]) -> Float[Array, "K A"]:
-    """Times of the arrivals of every stream in order, `NEVER` after its end.
+    """Arrival times (s) of every stream in order, `NEVER` after its end.
 
-    The process is stationary from `begin` on: that falls into a platoon or between two by their shares.
+    The process is stationary from `begin` on: that moment falls into a platoon, or between two, in
+    proportion to their durations.
     """
     key = jax.random.fold_in(key, _ARRIVALS)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, demand.stream)
     draws = jax.vmap(lambda k: jax.random.uniform(k, (demand.arrivals + 1,)))(keys)
     headway, size = demand.headway[:, None], demand.size[:, None]
     block = size.astype(headway.dtype) * headway
-    # s since the last platoon began, and how many of it have passed; its whole block between platoons
+    # s since the last platoon began (its whole block between platoons), and vehicles of it that passed
     passed = jnp.minimum(draws[:, :1] * (block + demand.idle[:, None]), block)
     done = jnp.ceil(passed / jnp.where(headway > 0, headway, 1)).astype(jnp.int32)
     place = jnp.minimum(done, size) + jnp.arange(demand.arrivals, dtype=jnp.int32)[None]
@@ -142,7 +143,7 @@ def _sample_arrivals(demand: Demand, key: Key[Array, ""]) -> Float[Array, "K A"]
 def _sample_queues(
     demand: Demand, key: Key[Array, ""]
 ) -> tuple[Float[Array, " V"], Int[Array, " V"], Int[Array, " V"], Int[Array, " V"]]:
-    """Time, lane, place in the queue and stream of every row of the schedule."""
+    """Time (s), lane, place in the queue and stream of every row."""
     time = _sample_arrivals(demand, key)[demand.row_stream, demand.row_arrival]
     time = jnp.where(demand.row_origin < demand.lane.shape[0], time, NEVER)
     origin, time, stream = lax.sort((demand.row_origin, time, demand.row_stream), num_keys=2)
@@ -151,7 +152,7 @@ def _sample_queues(
 
 
 def _sample_seats(demand: Demand, key: Key[Array, ""]) -> tuple[Int[Array, " M"], Float[Array, " M"]]:
-    """Seats that are taken, and where in them (0..1)."""
+    """Seats that are taken, and the place in each (0..1)."""
     key = jax.random.fold_in(key, _SEATS)
     seats = demand.seat_weight.shape
     # weighted sampling without replacement: the largest sums of logarithm and Gumbel noise
@@ -175,7 +176,10 @@ def _sample_roles(
 def departure_place(
     lane_map: LaneMap, lane: Int[Array, " V"], length: Float[Array, " V"]
 ) -> Float[Array, " V"]:
-    """Front bumper (m) of vehicles that enter where a lane starts: bodies on it, if it is long enough."""
+    """Front bumper (m) of vehicles that enter where a lane starts.
+
+    The whole body is on the lane if that is long enough. `length` in m.
+    """
     most = lane_map.length[lane]
     return jnp.minimum(length, jnp.maximum(most - 0.5, 0.5 * most))
 
@@ -187,33 +191,36 @@ def entry_speed(
     s: Float[Array, " V"],
     goal: Int[Array, " V"],
 ) -> Float[Array, " V"]:
-    """Speed (m/s) at which the road alone lets a vehicle start at `s` (m) of `lane` on its way to `goal`.
+    """Speed (m/s) at which the road alone lets a vehicle start.
 
-    At most what its driver wants here, and what braking with `b` brings down in time to the limits and
-    bends of the next lanes, and to rest before a junction or the end of a lane that does not lead on.
+    At most the desired speed here. Braking with `b` must suffice for the limits and bends of the next lanes,
+    and to stop before a junction or the end of a lane that does not lead on.
+
+    Args:
+      lane_map: where.
+      driver: of the vehicles.
+      lane: on which they start.
+      s: m along it.
+      goal: column of the route table.
     """
     here = lane_map.speed_limit[lane], curvature(lane_map, lane, s)
     speed = desired_speed(driver, *here)
     square = speed * speed
     brake = 2 * driver.b
-    share = jnp.arange(1, _BEND_POINTS + 1, dtype=speed.dtype)[None] / _BEND_POINTS
+    share = jnp.arange(1, BEND_POINTS + 1, dtype=speed.dtype)[None] / BEND_POINTS
     reach = jnp.minimum(square / brake, lane_map.length[lane] - s)
-    bend = curvature(lane_map, lane[:, None], s[:, None] + reach[:, None] * share)
-    slow = driver.a_lat[:, None] / jnp.maximum(jnp.abs(bend), 1e-6)
+    slow = bend_squares(lane_map, driver, lane, s[:, None] + reach[:, None] * share)
     square = jnp.minimum(square, (slow + (brake * reach)[:, None] * share).min(-1))
     start = -s
     for _ in range(_LOOK):
         after = lane_map.routes.next_lane[lane, goal]
         end = start + lane_map.length[lane]
-        wall = (after == NO_LANE) & ~lane_map.routes.is_goal[lane, goal] & (lane != NO_LANE)
+        dead_end = (after == NO_LANE) & ~lane_map.routes.is_goal[lane, goal] & (lane != NO_LANE)
         stop = start + lane_map.stop_s[lane] - 1
         stop = jnp.where(lane_map.is_connector[after] & ~lane_map.is_connector[lane], stop, _FAR)
-        stop = jnp.minimum(stop, jnp.where(wall, end - _WALL_ROOM, _FAR))
+        stop = jnp.minimum(stop, jnp.where(dead_end, end - _DEAD_END_ROOM, _FAR))
         square = jnp.minimum(square, brake * jnp.maximum(stop, 0))
-        slow = jnp.minimum(
-            driver.speed_factor * lane_map.speed_limit[after], bend_speed(lane_map, after, driver.a_lat)
-        )
-        slow = jnp.where(after == NO_LANE, _FAR, slow)
+        slow = lane_speed(lane_map, after, driver.speed_factor, driver.a_lat)
         square = jnp.minimum(square, slow * slow + brake * jnp.maximum(end, 0))
         lane, start = after, end
     return safe_sqrt(square)
@@ -230,7 +237,7 @@ def _start(
     free: Float[Array, " M"],
     goal: Int[Array, " M"],
 ) -> State:
-    """The world before anybody enters; `free`: m/s on an empty road."""
+    """The world before any vehicle enters; `free`: m/s on an empty road."""
 
     def fill(x: Array, empty: Any) -> Array:
         return jnp.concatenate([x, jnp.full(slots - x.shape[0], empty, x.dtype)])
@@ -245,7 +252,7 @@ def _start(
 
 
 def _start_speed(lane_map: LaneMap, state: State, free: Float[Array, " N"]) -> Float[Array, " N"]:
-    """Speeds at which everybody can follow whoever is ahead, m/s, at most `free`."""
+    """Speeds (m/s) at which vehicles can follow their leaders, at most `free`."""
     order = sort_vehicles(lane_map, state)
     n = state.lane.shape[0]
     here = state.lane[:, None], state.s[:, None], order.rank[:n, None] + 1
@@ -259,7 +266,7 @@ def _start_speed(lane_map: LaneMap, state: State, free: Float[Array, " N"]) -> F
 
 
 def typical_vehicles(population: Population, n: int) -> tuple[Driver, Shape]:
-    """Medians of the first type of a population, `[n]`: harmless values for empty slots."""
+    """Medians of the first type of a population, `[n]`, for empty slots."""
     values = {name: jnp.full(n, population.median[0, k]) for k, name in enumerate(PARAMETERS)}
     body = {name: values.pop(name) for name in BODY}
     return Driver(**values), Shape(**body, vehicle_class=jnp.full(n, population.vehicle_class[0]))

@@ -30,9 +30,9 @@ _MARGIN = 2.0  # m from the bodies of vehicles at the start to both ends of thei
 def lay_out_seats(
     tables: Tables, density: float, wanted: NDArray[np.float64], egos: EgoStart | None
 ) -> dict[str, Any]:
-    """Places for vehicles at the start, about twice as many as there are vehicles.
+    """Lay out places at the start, about two per vehicle.
 
-    `wanted` has the traffic to every goal: goals are drawn in these proportions, where it can be.
+    `wanted` is the traffic to every goal: goals are drawn in these proportions where they can be reached.
     """
     lanes = [lane for lane in tables.network.drivable_lanes() if lane.junction is None]
     open_to = {lane.id: tables.allowed[tables.rows[lane.id]] @ tables.shares for lane in lanes}
@@ -70,7 +70,7 @@ def lay_out_seats(
 def _places(
     tables: Tables, lanes: list[Lane], pitch: float, egos: EgoStart | None
 ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
-    """Row, hindmost front bumper and room from there (m) of places `pitch` m apart.
+    """Places `pitch` m apart: row, hindmost front bumper (m) and room from there (m).
 
     Bodies lie within one lane, some goal can be reached, and no two bodies of any size overlap.
     """
@@ -107,7 +107,7 @@ def _fits(
     s: NDArray[np.float64],
     slack: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Which types `[S, Y]` are narrow enough for the lane along the whole place."""
+    """Types narrow enough for the lane at each place, `[S, Y]`."""
     by_row = {tables.rows[lane.id]: lane for lane in lanes}
     share = np.linspace(0, 1, 7)
     rear = s - tables.lengths[1]
@@ -122,7 +122,10 @@ def _apart(
     s: NDArray[np.float64],
     slack: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Mask of places whose bodies, of any size and anywhere in their place, touch none of another place."""
+    """Mask of places whose bodies touch no body of another kept place.
+
+    Bodies may have any size, and be anywhere in their place.
+    """
     by_row = {tables.rows[lane.id]: lane for lane in tables.network.drivable_lanes()}
     lengths = np.linspace(*tables.lengths, 3)
     share = np.linspace(0, 1, 3)

@@ -1,4 +1,4 @@
-"""SUMO's vehicles, trips and flows as a schedule: who departs when, where, how fast and by which way."""
+"""SUMO's vehicles, trips and flows as a schedule: time, place, speed and route."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from limsim_jax.types import Queues, Scenario, Schedule
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SumoScenario:
-    """What comes of a SUMO demand: an empty road, and a schedule of those who enter."""
+    """A SUMO demand as a scenario: an empty road, and a schedule of departures."""
 
     lane_map: LaneMap
-    """With the ways of these vehicles as `routes`; its signal programs start where they are at `begin`."""
+    """With the routes of these vehicles as `routes`; its signal programs start where they are at `begin`."""
     scenario: Scenario
     vehicles: tuple[str, ...]
     """Ids of the vehicles in the rows of the schedule; those of a flow have its id and a number."""
     routes: tuple[tuple[str, ...], ...]
     """Edges of every goal; only the last one where the way there is free."""
     notes: tuple[str, ...]
-    """One line per thing that is left out or done in another way than SUMO does, with counts."""
+    """One line, with counts, per thing that is left out or done in another way than in SUMO."""
 
 
 def sumo_scenario(
@@ -59,12 +59,12 @@ def sumo_scenario(
       demand: from `maps.sumo.read_demand`.
       slots: vehicle slots of the world.
       begin: time of the files at which the scenario starts, s; default: that of the first departure.
-      end: s; nobody departs from then on.
+      end: s; no vehicle departs from then on.
       seed: of all draws.
 
     Raises:
       MapError: a vehicle type that no file defines, or a flow without an end.
-      ValueError: nobody departs.
+      ValueError: no vehicle departs.
     """
     notes = _Notes()
     departures = _departures(demand, end, np.random.default_rng([seed, 0]), notes)
@@ -125,7 +125,7 @@ class _Departure:
 def _departures(
     demand: Demand, end: float | None, rng: np.random.Generator, notes: _Notes
 ) -> list[_Departure]:
-    """Everybody who departs before `end`, in the order of the files."""
+    """All departures before `end`, in the order of the files."""
     found: list[tuple[str, float, Vehicle]] = []
     for vehicle in demand.vehicles.values():
         if isinstance(vehicle.depart, str):
@@ -239,7 +239,7 @@ class _Ways:
         return self.known[key]
 
     def _add(self, table: RouteTable, edges: tuple[str, ...], group: str | None) -> None:
-        """A column serves all that remains of its route on the way, but not a destination by itself."""
+        """Add a column: it serves the rest of its route, but not its destination by itself."""
         column = len(self.columns)
         self.columns.append(table)
         self.routes.append(edges)
@@ -364,7 +364,7 @@ def _depart_lane(
     rng: np.random.Generator,
     notes: _Notes,
 ) -> Lane | None:
-    """The lane that departLane asks for, or the nearest one from which there is a way."""
+    """The lane of departLane, or the nearest that leads to the goal."""
     table = ways.columns[goal]
     lanes = [
         lane
@@ -421,7 +421,7 @@ def _scenario(
     slots: int,
     seed: int,
 ) -> Scenario:
-    """Departures in order of lane and time as a scenario with empty roads."""
+    """A scenario of empty roads and departures, sorted by lane and time."""
     lanes = sorted({d.row for d in placed})
     rows, origins = bucket(len(placed), 64), bucket(len(lanes), 4)
 

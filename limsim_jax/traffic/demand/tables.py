@@ -1,4 +1,4 @@
-"""Tables of a map and a population on the host, on which flows and seats are laid out."""
+"""Tables of a map and a population on the host."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from limsim_jax.maps.network import Network
 from limsim_jax.traffic.vehicles import PARAMETERS, Population
 
 CHANGE_ROOM, CHANGE_TIME = 60.0, 6.0
-"""m, and s at the speed limit, per lane to cross: who starts or enters is given no goal that leaves less."""
+"""m, and s at the speed limit, per lane to cross: the least room to the goal of a vehicle that starts."""
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,13 @@ class Tables:
         )
 
     def leaves_room(self, row: Any, s: Any) -> NDArray[np.bool_]:
-        """Goals `[*b, G]` that leave room to change lanes to who is at `s` (m) of `row`."""
+        """Goals with room to change lanes from `s` (m) of `row`, `[*b, G]`."""
         room = self.change_distance[row] - np.asarray(s)[..., None]
         per_lane = np.maximum(CHANGE_ROOM, CHANGE_TIME * self.speed_limit[row])[..., None]
         return self.reachable[row] & (room > per_lane * np.abs(self.lanes_to_go[row]))
 
 
 def cumulative(shares: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cumulative shares along the last axis, exactly 1 from the last positive one on."""
+    """Cumulative shares along the last axis; they end in exactly 1."""
     total = np.cumsum(shares, -1)
     return np.where(total >= total[..., -1:] * (1 - 1e-12), 1.0, total / total[..., -1:])

@@ -26,7 +26,7 @@ class Approaches(NamedTuple):
 
 
 def approaches_ahead(config: Config, lane_map: LaneMap, state: State, ahead: Ahead) -> Approaches:
-    """The first connectors on the route of every vehicle, from its own lane on.
+    """The first connectors on the route of every vehicle.
 
     Args:
       config: `look_ahead` limits how far away a connector may be.

@@ -62,7 +62,7 @@ class _Pairs(NamedTuple):
 
 
 class _Foes(NamedTuple):
-    """The vehicles on the other path of every pair, `Q` each, the nearest first."""
+    """Vehicles on the other path of every pair: `Q` each, nearest first."""
 
     me: Observed  # [1, P]
     other: Observed  # [Q, P]
@@ -183,14 +183,14 @@ def _sorted(lane_map: LaneMap, state: State, approaches: Approaches, observed: O
 
 
 def _share(lane_map: LaneMap, connector: Array, x: Array) -> Array:
-    """Place `x` (m) along a connector and the `_BEHIND` m before it, as a share of both."""
+    """Place `x` (m) along a connector as a share; 0 is `_BEHIND` before it."""
     return (x + _BEHIND) / (lane_map.conflicts.length[connector] + _BEHIND)
 
 
 def _pairs(
     lane_map: LaneMap, state: State, approaches: Approaches, observed: Observed, connector: Int[Array, " A"]
 ) -> _Pairs:
-    """List the conflicts that matter: near, and with a vehicle on the other path (in `connector`)."""
+    """List the conflicts that matter: near, and with a vehicle on the other path."""
     table, k = lane_map.conflicts, approaches.connector
     n, size, slots = state.lane.shape[0], table.length.shape[0], table.foe.shape[1]
     busy = jnp.zeros(size, bool).at[jnp.where(connector < 0, size, connector)].set(True, mode="drop")
@@ -219,7 +219,7 @@ def _pairs(
 
 
 def _foes(lane_map: LaneMap, connectors: _OnConnectors, pairs: _Pairs, observed: Observed) -> _Foes:
-    """The vehicles on the other paths that have not cleared the conflict areas."""
+    """Find vehicles on the other paths that have not cleared the conflict."""
     table, k, c = lane_map.conflicts, pairs.connector, pairs.conflict
     connector, entries, keys, entry = connectors
     count = connector.shape[0]
@@ -251,7 +251,7 @@ def _foes(lane_map: LaneMap, connectors: _OnConnectors, pairs: _Pairs, observed:
 def _leader(
     n: int, pairs: _Pairs, gap: Float[Array, "Q P"], need: Float[Array, "Q P"], slot: Array
 ) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
-    """Of all vehicles `slot` that `n` vehicles may follow, the one that leaves the least room to stop.
+    """The vehicle to follow: the one that leaves the least room.
 
     Args:
       n: number of slots.

@@ -17,7 +17,7 @@ from limsim_jax.xla import computed_once
 
 
 class Observed(NamedTuple):
-    """What other drivers can tell about a vehicle on its way to or over a connector. One shape for all."""
+    """What other drivers can tell about a vehicle near a connector. All of one shape."""
 
     front: Array  # m, front bumper along the connector
     length: Array  # m
@@ -53,7 +53,7 @@ class Passage(NamedTuple):
 
 
 class Encounter(NamedTuple):
-    """Two vehicles at one conflict area, as far as both see it alike whatever delays them."""
+    """Two vehicles at a conflict area, without the delays by others."""
 
     decided: Array  # one of them, or both, can no longer wait: no choice is left
     decided_first: Array  # whether `me` goes first then
@@ -65,7 +65,7 @@ class Encounter(NamedTuple):
 def travel_time(
     distance: Float[Array, "*#b"], v: Float[Array, "*#b"], v_end: Float[Array, "*#b"], a: Float[Array, "*#b"]
 ) -> Float[Array, "*b"]:
-    """Seconds to cover `distance` m from speed `v`, accelerating with `a` up to `v_end >= v`.
+    """Time (s) for a distance (m), accelerating up to `v_end >= v`.
 
     0 for a negative distance. Speeds in m/s, `a` in m/s^2.
     """
@@ -154,7 +154,10 @@ def _passage(
     arrival: Array,
     merges: Array,
 ) -> Passage:
-    """What `vehicle`, `distance_in` m and `arrival` s from the stretch, needs to pass before `other`."""
+    """What a vehicle needs to pass before `other`.
+
+    It is `distance_in` m and `arrival` s away from the conflict area.
+    """
     start = jnp.minimum(vehicle.v, vehicle.turn_speed)
     a = JUNCTIONS.passing_acceleration * vehicle.a
     # in a merge it has to be in front by its length; at a crossing it has to have left

@@ -39,7 +39,7 @@ class RightOfWay(NamedTuple):
 def give_way(
     lane_map: LaneMap, state: State, approaches: Approaches, own: Pair, lights: Lights
 ) -> RightOfWay:
-    """Where every vehicle has to wait, and which it follows through merges and splits.
+    """Where every vehicle has to wait, and which vehicle it follows.
 
     Args:
       lane_map: where.
@@ -61,7 +61,7 @@ def give_way(
     standing = (own.lead >= 0) & (state.v[own.lead] < stands) & (state.v < stands)
     queued = standing & (own.lead_gap < JUNCTIONS.queue_gap * driver.s0 + JUNCTIONS.queue_room)
     starts = state.a > JUNCTIONS.starting
-    # stands for long and does not yield: whatever else it waits for
+    # it stands for long and does not yield, so it waits for something that others do not see
     queued |= (state.v < stands) & (state.waiting > JUNCTIONS.tie_time) & ~state.yielding & ~starts
     sign, stopped = stop_signs(lane_map, state, approaches)
 

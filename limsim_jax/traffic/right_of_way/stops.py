@@ -84,7 +84,7 @@ def exit_full(lane_map: LaneMap, state: State, approaches: Approaches, own: Pair
 def stop_signs(
     lane_map: LaneMap, state: State, approaches: Approaches
 ) -> tuple[Bool[Array, "N R"], Bool[Array, " N"]]:
-    """Whether a stop sign still has to be obeyed, and which vehicles have stopped at the one ahead."""
+    """Stop signs still to be obeyed, and vehicles that have done so."""
     sign = lane_map.conflicts.must_stop[approaches.connector] & (approaches.line > -JUNCTIONS.margin)
     near = approaches.line[:, 0] < JUNCTIONS.sign_distance
     stopped = sign[:, 0] & (state.stopped | ((state.v < JUNCTIONS.sign_speed) & near))
