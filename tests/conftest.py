@@ -24,6 +24,13 @@ from jaxtyping import install_import_hook  # noqa: E402
 _hooked = ["limsim_jax.numerics", "limsim_jax.geometry"]
 _hooked += [f"limsim_jax.maps.{name}" for name in ("outline", "rasterise", "routing", "signals")]
 _hooked += [f"limsim_jax.maps.conflicts.{name}" for name in ("build", "overlaps", "priority", "waiting")]
+_traffic = "car_following", "collision", "lane_change", "motion", "neighbors", "signals", "speeds", "state"
+_hooked += [f"limsim_jax.traffic.{name}" for name in _traffic]
+_demand = "build", "departures", "flows", "sample", "seats", "sumo", "tables"
+_hooked += [f"limsim_jax.traffic.demand.{name}" for name in _demand]
+_hooked += [
+    f"limsim_jax.traffic.right_of_way.{x}" for x in ("approaches", "meet", "passage", "rules", "stops")
+]
 install_import_hook(_hooked, "shape_checks.typecheck")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")

@@ -23,7 +23,7 @@ but `b_max` where the braking limit acts. It means nothing across a change of le
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,7 @@ _MIN_RATE = 1e-3  # m/s^2, floor under accelerations that divide
 Values = Float[Array, "*#b"]
 
 
+@runtime_checkable
 class CarFollowing(Protocol):
     """What the models have in common; the module's docstring tells what the arguments mean."""
 

@@ -137,7 +137,7 @@ def _follow(value: Array, command: Array, lag: Array | float, rate: Array | floa
 
 
 def _arc(heading: Array, distance: Array, bend: Array, wheelbase: Array) -> tuple[Array, Array, Array]:
-    """Displacement (m) of the centre and turn (rad) on an arc of the rear axle."""
+    """Displacement (m) and turn (rad) of the body on an arc."""
     turn = bend * distance
     half = turn / 2
     small = jnp.abs(half) < 0.5

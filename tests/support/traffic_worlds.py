@@ -75,7 +75,7 @@ def scattered(name: str, n: int, seed: int, spacing: float = 30.0, v: float = 15
 
 
 def no_arrivals(state: State) -> Schedule:
-    """A schedule by which nobody enters the world of this state."""
+    """A schedule without departures, for the world of this state."""
     zero = jnp.zeros(1, jnp.int32)
     return Schedule(
         time=jnp.full(1, 1e9), lane=zero - 1, s=jnp.zeros(1), v=jnp.zeros(1), goal=zero,

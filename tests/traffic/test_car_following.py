@@ -176,7 +176,7 @@ def test_values_are_bounded_and_gradients_finite(model, empty):
 
 @each_model
 def test_overlap_and_rest(model):
-    """Where bodies overlap it brakes as hard as it can, and nobody leaves a standing queue too near."""
+    """Where bodies overlap it brakes as hard as it can, and no vehicle starts too near a standing leader."""
     driver = make_driver()
     assert accelerate(model, driver, -1.0, 5.0, 5.0, 0.0, 10.0) == -9.0
     assert accelerate(model, make_driver(s0=0.0), 0.0, 0.0, 0.0, 0.0, 10.0) == -9.0

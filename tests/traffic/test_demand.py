@@ -71,10 +71,10 @@ def arrivals(name, flow, n=16, **kwargs):
     return [row[row < NEVER] for row in times[:, :stop]], demand
 
 
-# --- where vehicles come in -------------------------------------------------------------------------
+# --- origins ----------------------------------------------------------------------------------------
 
 
-def test_entries_are_the_ways_into_the_bundled_maps():
+def test_origins_are_the_ways_into_the_bundled_maps():
     count = {name: {k: len(v) for k, v in origins(bundled(name)[0]).items()} for name in ("highway", "ramp")}
     assert count == {"highway": {"1-": 4, "2+": 4}, "ramp": {"1": 3, "4": 3, "5": 1}}
     # of the four arms of the intersection two lanes each; the pockets that begin later are no origins
@@ -186,7 +186,7 @@ def test_vehicles_of_a_queue_do_not_depend_on_other_flows_nor_on_companions():
 
 
 def test_turning_ratios_and_classes():
-    """Chi-square tests of drawn goals and classes; who cannot go there does not."""
+    """Chi-square tests of drawn goals and classes; no vehicle gets a goal that it cannot reach."""
     network, lane_map = bundled("intersection")
     goals = list(default_goals(network))
     shares = {goals[3]: 1.0, goals[1]: 3.0, goals[2]: 6.0}
@@ -239,7 +239,7 @@ def test_lanes_are_open_to_the_classes_that_enter_on_them():
 
 @pytest.mark.parametrize(("name", "density"), [("roundabout", 24.0), ("ramp", 30.0)])
 def test_vehicles_at_the_start(name, density):
-    """Nobody overlaps, everybody can reach the goal, and all can follow and stop."""
+    """No vehicles overlap, all can reach their goals, follow and stop."""
     network, lane_map = bundled(name)
     flows = [Flow(origin=list(origins(network)), rate=600.0)]
     demand = demand_of(name, flows, default_population(), horizon=60.0, density=density)
@@ -266,7 +266,7 @@ def test_vehicles_at_the_start(name, density):
         assert (room > per_lane * np.abs(routes.lanes_to_go[lane, goal])).all()
         ends = (routes.next_lane[lane, goal] < 0) & ~routes.is_goal[lane, goal]
         assert (np.asarray(lane_map.length)[lane[ends]] - s[ends] > 25.0).all()
-        # who follows somebody on the lane can stop behind them: v T + v^2 / 2 b <= gap - s0 + v_lead^2 / 2 b
+        # followers can stop behind their leaders: v T + v^2 / 2 b <= gap - s0 + v_lead^2 / 2 b
         driver = jax.tree.map(lambda x: x[: demand.initial], state.driver)
         for i in range(n):
             on = np.flatnonzero((lane == lane[i]) & (s > s[i]))

@@ -46,14 +46,14 @@ def schedule_of(lane, time, goal, v=20.0, s=None, length=5.0):
 
 
 def empty(name, slots, schedule):
-    """Nobody on the road, and nobody has entered."""
+    """An empty road, before the first departure."""
     state = state_of(name, [NO_LANE] * slots, [0.0] * slots, [0.0] * slots, [0] * slots)
     queues = dataclasses.replace(state.queues, next=schedule.start[:-1])
     return dataclasses.replace(state, queues=queues)
 
 
 def move(state, seconds):
-    """Everybody goes on at constant speed; who is 500 m away is gone."""
+    """Move all vehicles at constant speed; those beyond 500 m leave."""
     s = state.s + seconds * state.v
     gone = s > 500.0
     return dataclasses.replace(
@@ -65,8 +65,8 @@ ROWS = [lane_rows(bundled("highway")[0])[f"1_0_-{i}"] for i in (3, 4, 5, 6)]
 GOAL = int(np.flatnonzero(np.asarray(bundled("highway")[1].routes.reachable)[ROWS[0]])[0])
 
 
-def test_queues_never_drop_anybody():
-    """A standing vehicle blocks one lane for 20 s; slots are few for a while; nobody is lost."""
+def test_queues_never_drop_a_vehicle():
+    """A standing vehicle blocks one lane for 20 s; slots are few for a while; no vehicle is lost."""
     _, lane_map = bundled("highway")
     rng = np.random.default_rng(0)
     time = [np.sort(rng.uniform(0, 60, n)) for n in (20, 25, 0, 18)]
@@ -211,7 +211,7 @@ def test_room_to_the_leader(other, enters):
         assert v <= 20.0 and v * 1.2 + v * v / 4 <= gap - 2.0 + other["v"] ** 2 / 4 + 1e-3
 
 
-def test_room_across_lane_ends_and_the_tail_of_who_turned_off():
+def test_room_across_lane_ends_and_the_tail_of_a_vehicle_that_turned_off():
     """On short lanes the leader stands on the next one, or has turned off but for its tail."""
     _, lane_map = bundled("intersection")
     routes, length = lane_map.routes, np.asarray(lane_map.length)
@@ -234,7 +234,7 @@ def test_room_across_lane_ends_and_the_tail_of_who_turned_off():
     assert count(lane=other, s=3.9) == 1
 
 
-def test_room_to_those_who_come_from_behind():
+def test_room_to_followers():
     """A departure in the middle of a road: followers on the lane and on those before it, by their routes."""
     _, lane_map = bundled("ramp")
     after = np.asarray(lane_map.routes.next_lane)
@@ -260,7 +260,7 @@ def test_room_to_those_who_come_from_behind():
         assert count(near, goal=int(np.flatnonzero(others)[0])) == 1, "it goes elsewhere"
 
 
-def test_two_do_not_enter_right_behind_one_another():
+def test_two_vehicles_do_not_enter_right_behind_one_another():
     _, lane_map = bundled("ramp")
     after, length = np.asarray(lane_map.routes.next_lane), np.asarray(lane_map.length)
     first, goal = next((int(a), int(g)) for a, g in np.argwhere(after >= 0))
@@ -316,7 +316,7 @@ def minute(schedule, state, decisions):
     return jax.lax.scan(decision, state, None, length=decisions)
 
 
-def nobody_overlaps(trace):
+def no_overlap(trace):
     for active, box in zip(trace["active"], trace["box"], strict=True):
         box = box[active]
         for i in range(len(box)):
@@ -338,7 +338,7 @@ def test_insertion_on_a_highway_is_safe(place):
         schedule = dataclasses.replace(schedule, s=jnp.full_like(schedule.s, 900.0), v=schedule.v * 0.7)
     end, trace = minute(schedule, state, 120)
     trace = jax.tree.map(np.asarray, trace)
-    assert nobody_overlaps(trace)
+    assert no_overlap(trace)
     now = 0.5 * (np.arange(120) + 1)[:, None]
     young = trace["active"] & (trace["vehicle"] >= 0) & (now - trace["entered"] < 10.0)
     assert trace["a"][young].min() > -5.0
@@ -347,10 +347,10 @@ def test_insertion_on_a_highway_is_safe(place):
     due = int((schedule.time < 59.5).sum())
     assert entered + int(delayed(schedule, end, 59.5).sum()) == due
     if place == "start":
-        # who came in goes with the traffic, and most came in; the rest waits
+        # vehicles that entered go with the traffic, and most entered; the rest waits
         assert 0.75 * due < entered and trace["v"][young].mean() > 22.0
     else:
-        # followers on the lane do not have to brake hard for those who come in before them
+        # followers on the lane do not have to brake hard for vehicles that enter before them
         assert entered > 40
         behind = trace["active"] & (trace["s"] > 600) & (trace["s"] < 900)
         assert trace["a"][behind].min() > -5.0

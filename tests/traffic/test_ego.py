@@ -153,7 +153,7 @@ def test_braking_takes_v_squared_over_twice_the_deceleration_and_ends_in_rest():
     _, trace = run(roll, "intersection", INSTANT, state, controls(-b, 0.1))
     np.testing.assert_allclose(trace["travelled"][-1], v * v / (2 * b), rtol=1e-4, atol=1e-5)
     assert (trace["v"] >= 0).all() and not trace["v"][-1].any() and not trace["a"][-1].any()
-    assert not trace["drive"][-1].any(), "who stands does not store up its braking"
+    assert not trace["drive"][-1].any(), "an ego that stands does not store up its braking"
 
 
 def test_actuators_keep_their_limits_and_lag():
@@ -376,7 +376,7 @@ def test_a_lane_change_by_steering():
     assert (side == 1).any() and (side == -1).any() and side[0] == side[-1] == 0
 
 
-def test_who_crosses_a_line_at_the_end_of_the_lanes_stays_on_the_route():
+def test_an_ego_that_crosses_a_line_at_the_end_of_the_lanes_stays_on_the_route():
     """The lanes beyond the line part there, and overlap: the body is on both, the route goes on along one."""
     _, lane_map = bundled("roundabout")
     after, parts = np.asarray(lane_map.routes.next_lane), np.asarray(lane_map.successors)
@@ -432,7 +432,7 @@ def test_an_ego_that_turns_round_is_on_the_oncoming_lane():
     _, trace = run(roll, "intersection", INSTANT, dataclasses.replace(state, egos=e), controls(0.0, 0.0))
     assert trace["lane"][0, 0] == other
     np.testing.assert_allclose(trace["d"][0, 0], 0.4, atol=0.05)
-    assert trace["lane"][0, 1] == row, "who overtakes there still has its own lane"
+    assert trace["lane"][0, 1] == row, "an ego that overtakes there still has its own lane"
     np.testing.assert_allclose(trace["d"][0, 1], 3.5 + 0.3, atol=0.3)
 
 
@@ -534,7 +534,7 @@ def test_other_traffic_moves_as_without_egos():
     e = both.egos
     np.testing.assert_array_equal(over[slot], [e.x[0], e.y[0], e.heading[0], 5.0, np.float32(1.9)])
     np.testing.assert_allclose(over[slot, :2], box[slot, :2], atol=1e-3)
-    assert e.x[1] == state.egos.x[1], "who keeps to lanes is not moved by its control"
+    assert e.x[1] == state.egos.x[1], "an ego that keeps to lanes is not moved by its control"
     synced = ego.sync(lane_map, both, boxes(lane_map, both)).egos
     np.testing.assert_array_equal([synced.x[1], synced.y[1]], box[int(e.slot[1]), :2])
     assert synced.x[0] == e.x[0] and synced.steering[0] == e.steering[0]
@@ -632,7 +632,7 @@ def test_tracking_circles_and_lane_changes(lag, bound):
     assert np.linalg.norm(there - goal, axis=-1)[30:].max() < 0.25, "at the right time, too"
 
 
-def test_who_creeps_keeps_the_wheels_turned():
+def test_a_creeping_ego_keeps_its_wheels_turned():
     """Circles of 12 m to both sides; a trajectory that does not move says nothing about the wheels."""
     v = [0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.2, 0.4]
     state = free_world("roundabout", [0], [40.0], v)

@@ -73,17 +73,17 @@ def test_random_traffic_on_a_highway_is_sound(seed):
     trace = {name: np.asarray(value) for name, value in trace.items()}
     active = trace["active"]
     assert trace["apart"].min() > 0, "bodies overlap"
-    assert trace["a"].min() > -4.0, "nobody has to brake hard"
+    assert trace["a"].min() > -4.0, "no vehicle has to brake hard"
     assert np.isfinite(trace["v"]).all() and (trace["v"] >= 0).all()
-    # nobody leaves the road: the centre stays within the lane, but for lane changes to a neighbour
+    # no vehicle leaves the road: the centre stays within the lane, but for lane changes to a neighbour
     half = np.asarray(width(lane_map, jnp.asarray(trace["lane"]), jnp.asarray(trace["s"]))) / 2
     assert (np.abs(trace["d"])[active] <= half[active] + 0.01).all()
-    # bodies move by what their speed says: nobody jumps
+    # bodies move by what their speed says: none jumps
     step = np.hypot(np.diff(trace["x"], axis=0), np.diff(trace["y"], axis=0))
     both = active[1:] & active[:-1]
     assert (step[both] < trace["v"][:-1][both] * CONFIG.dt + 0.35).all()
-    assert (trace["side"][active] != 0).mean() > 0.005, "somebody changes lanes"
-    assert trace["left"].sum() == n - int(end.active.sum()) > n // 2, "who leaves, leaves once"
+    assert (trace["side"][active] != 0).mean() > 0.005, "some vehicles change lanes"
+    assert trace["left"].sum() == n - int(end.active.sum()) > n // 2, "a vehicle leaves once"
     assert not int(np.bitwise_or.reduce(np.asarray(end.status))) & int(Status.HARD_BRAKE)
     assert network.lanes
 
@@ -99,7 +99,7 @@ def test_lane_ends_and_exits_are_reached_without_overlap():
 
 
 def test_a_bend_ahead_is_reached_at_the_speed_that_it_allows():
-    """Nobody is in the way: at 50 km/h towards the roundabout, whose entry bends with 12 m radius."""
+    """On a free road, at 50 km/h towards the roundabout, whose entry bends with 12 m radius."""
     network, lane_map = bundled("roundabout")
     row = lane_rows(network)["1_0_-3"]
     goal = int(np.nonzero(np.asarray(lane_map.routes.reachable)[row])[0][-1])
@@ -116,8 +116,8 @@ def test_a_bend_ahead_is_reached_at_the_speed_that_it_allows():
     assert float(trace["a"].min()) > -2.1
 
 
-def test_who_is_fast_brakes_in_time_for_who_stands():
-    """At 140 km/h towards somebody who stands: the whole way to stop is seen, so nobody brakes hard."""
+def test_a_fast_vehicle_brakes_in_time_for_a_stopped_one():
+    """At 140 km/h towards a stopped vehicle: the whole braking distance is seen, so braking is not hard."""
     network, lane_map = bundled("highway")
     row = lane_rows(network)["1_0_-3"]
     goal = int(np.nonzero(np.asarray(lane_map.routes.reachable)[row])[0][0])
@@ -248,7 +248,7 @@ def test_mobil_incentive():
 
 @pytest.mark.parametrize("a_lead", [0.0, -2.7, 1.5])
 def test_braking_for_a_leader_that_brakes_on(a_lead):
-    """Followed step by step, both are as fast when the gap is used up; who speeds up counts as steady."""
+    """Step by step, both are as fast when the gap is used up; a leader that speeds up counts as steady."""
     v, v_lead, gap = (np.asarray(x) for x in ([25.0, 18.0, 9.0], [17.0, 16.0, 12.0], [20.0, 6.0, 5.0]))
     seen = (v, v_lead, np.full(3, a_lead), gap)
     need = np.asarray(closing(*(jnp.asarray(x, jnp.float32) for x in seen)), float)
@@ -302,8 +302,8 @@ def test_a_lane_change_that_the_lanes_ahead_cut_off_is_taken_back():
 
 
 @pytest.mark.parametrize("lead", [-7.0, -1.5, 0.0, 2.0])
-def test_two_abreast_swap_lanes(lead):
-    """Each needs the lane of the other: one falls back, nobody waits until it gives up its goal."""
+def test_two_vehicles_abreast_swap_lanes(lead):
+    """Each needs the lane of the other: one falls back, and neither gives up its goal."""
     network, lane_map = bundled("intersection")
     rows = lane_rows(network)
     right, left = rows["6_0_-2"], rows["6_0_-1"]
@@ -321,7 +321,7 @@ def test_two_abreast_swap_lanes(lead):
     assert standing.sum(0).max() < 100  # of 600 steps of 0.1 s: no patience is tried
 
 
-def test_who_has_to_get_onto_the_next_lane_takes_its_pace():
+def test_a_merging_vehicle_takes_the_pace_of_the_other_lane():
     """On an acceleration lane, abreast of a leader that is too near to cut in behind."""
     network, lane_map = bundled("ramp")
     rows = lane_rows(network)
@@ -341,7 +341,7 @@ def test_who_has_to_get_onto_the_next_lane_takes_its_pace():
     assert float(trace["v"][:, 0].min()) > 5, "in motion"
 
 
-def test_who_waits_before_a_wrong_lane_too_short_to_wait_on_takes_another_goal():
+def test_a_vehicle_before_a_short_wrong_lane_takes_another_goal():
     """One lane, then 4 m of two, of which the left one leads to the goal."""
     beside = {"road": "p", "successors": ("right",), "left": "p1", "may_change_left": True}
     map_ = network([

@@ -129,7 +129,7 @@ def test_neighbors_are_those_of_the_loop(name, n, seed, far):
 
 
 def test_a_follower_two_lanes_back_is_seen():
-    """Over a short lane, as there are in SUMO's junctions; who turns off does not count."""
+    """Over a short lane, as in SUMO's junctions; a vehicle that turns off does not count."""
     map_ = network([
         straight("a", (0.0, 0.0), 0.0, 200.0, successors=("b", "off")),
         straight("b", (200.0, 0.0), 0.0, 4.0, successors=("c",)),

@@ -1,4 +1,4 @@
-"""Who goes first where paths meet: lights, signs, priority, gaps."""
+"""Right of way: lights, signs, priority, gaps."""
 
 import dataclasses
 import functools
@@ -48,8 +48,8 @@ def test_travel_time_is_that_of_the_motion():
     assert float(travel_time(jnp.float32(-3), jnp.float32(5), jnp.float32(5), jnp.float32(1))) == 0
 
 
-def random_sights(n, seed):
-    """Vehicles in all situations: before, on and behind the stretch, waiting, kept, under lights."""
+def random_vehicles(n, seed):
+    """Vehicles in all situations: before, in, behind the conflict area, waiting, yielding, under lights."""
     rng = np.random.default_rng(seed)
     v = rng.choice([0.0, 0.5, 4.0, 12.0], n) * rng.uniform(0.5, 1, n)
     slow = rng.uniform(3, 14, n)
@@ -68,7 +68,7 @@ def random_sights(n, seed):
 def test_of_two_vehicles_exactly_one_goes_first(merges):
     n = 20000
     rng = np.random.default_rng(7)
-    me, foe = random_sights(n, 1), random_sights(n, 2)
+    me, foe = random_vehicles(n, 1), random_vehicles(n, 2)
     start, length = rng.uniform(0, 15, (2, n)), rng.uniform(1, 12, (2, n))
     mine, theirs = (
         passage.Stretch(jnp.asarray(start[i], jnp.float32), jnp.asarray(start[i] + length[i], jnp.float32))
@@ -82,13 +82,13 @@ def test_of_two_vehicles_exactly_one_goes_first(merges):
     free = jnp.zeros(n, bool)
     a, b = (jnp.asarray(rng.random(n) < 0.3) for _ in range(2))
     later, sooner = (jnp.asarray(rng.choice([0.0, 3.0, 1e3], n), jnp.float32) for _ in range(2))
-    for x, y, kept in ((free, free, None), (a, b, None), (a, b, (later, sooner))):
-        first = passage.goes_first(one, (x, y), kept)
-        second = passage.goes_first(other, (y, x), kept and (kept[1], kept[0]))
+    for x, y, delay in ((free, free, None), (a, b, None), (a, b, (later, sooner))):
+        first = passage.goes_first(one, (x, y), delay)
+        second = passage.goes_first(other, (y, x), delay and (delay[1], delay[0]))
         np.testing.assert_array_equal(np.asarray(first), ~np.asarray(second))
     one = passage.goes_first(one, (free, free))
     assert 0.3 < np.asarray(one).mean() < 0.7
-    # who is on the stretch goes before who is not
+    # a vehicle inside the conflict area goes before one outside
     on, off = (
         np.asarray(mine.start - me.front) <= -0.5,
         np.asarray(theirs.start - foe.front) > np.asarray(foe.brake),
@@ -102,48 +102,52 @@ def meeting(me, foe, *, prio=1, **same):
         "front": 0.0, "length": 4.5, "v": 0.0, "top_speed": 10.0, "turn_speed": 10.0, "a": 1.5, "brake": 0.0,
         "waiting": 0.0, "line": 0.5, "blocked": 0.0, "yielding": 0.0, "slowing": 0.0, "light": 0.0,
     }  # fmt: skip
-    sights = [
+    both = [
         passage.Observed(**{k: jnp.float32(x) for k, x in (usual | own | {"slot": k}).items()})
         for k, own in enumerate((me, foe))
     ]
-    sights = [x._replace(brake=x.v * x.v / 8) for x in sights]
+    both = [x._replace(brake=x.v * x.v / 8) for x in both]
     way = passage.Stretch(jnp.float32(8.0), jnp.float32(16.0))
-    rivals = passage.compare(
-        sights[0], way, jnp.float32(1.5), sights[1], way, jnp.float32(1.5), jnp.int32(prio), jnp.int32(0),
+    encounter = passage.compare(
+        both[0], way, jnp.float32(1.5), both[1], way, jnp.float32(1.5), jnp.int32(prio), jnp.int32(0),
         jnp.bool_(False),
     )  # fmt: skip
 
-    def first(blocks=(False, False), kept=None):
-        kept = None if kept is None else (jnp.float32(kept[0]), jnp.float32(kept[1]))
-        return bool(passage.goes_first(rivals, (jnp.bool_(blocks[0]), jnp.bool_(blocks[1])), kept))
+    def first(obstructing=(False, False), delay=None):
+        delay = None if delay is None else (jnp.float32(delay[0]), jnp.float32(delay[1]))
+        return bool(
+            passage.goes_first(encounter, (jnp.bool_(obstructing[0]), jnp.bool_(obstructing[1])), delay)
+        )
 
     return first
 
 
-def test_who_has_priority_and_stands_is_passed_only_by_who_is_gone_before_it_can_go():
-    """One that is held while lower streams pass must not be held by those that could only come later."""
+def test_a_stopped_vehicle_with_priority_is_passed_only_by_vehicles_gone_before_it_can_start():
+    """A vehicle that yields to some must not wait for others that could only come later."""
     stands = {"yielding": 1.0, "waiting": 30.0}
     far, near = {"front": -60.0, "v": 12.0, "top_speed": 12.0, "turn_speed": 12.0}, {"front": -2.0, "v": 7.0}
-    # nobody keeps it: it goes before all that can still stop, though it is held at the moment
-    assert meeting(stands, far)() and meeting(stands, near)(kept=(0.0, 0.0))
-    # others keep it for 3 s: who is near is gone by then, who is far is not
-    assert not meeting(stands, near)(kept=(3.0, 0.0)) and meeting(stands, far)(kept=(3.0, 0.0))
-    # kept by one that stands it comes at no known time: all that are not held themselves may pass
-    assert not meeting(stands, far)(kept=(1e3, 0.0))
-    assert meeting(stands, near | {"yielding": 1.0, "v": 0.0})(kept=(1e3, 0.0))
+    # without delay it goes before all that can still stop, though it yields at the moment
+    assert meeting(stands, far)() and meeting(stands, near)(delay=(0.0, 0.0))
+    # delayed by 3 s: the near vehicle is gone by then, the far one is not
+    assert not meeting(stands, near)(delay=(3.0, 0.0)) and meeting(stands, far)(delay=(3.0, 0.0))
+    # delayed by a stopped vehicle, for an unknown time: all vehicles that do not yield may pass
+    assert not meeting(stands, far)(delay=(1e3, 0.0))
+    assert meeting(stands, near | {"yielding": 1.0, "v": 0.0})(delay=(1e3, 0.0))
 
 
-def test_who_stands_where_others_cross_goes_before_who_can_still_wait():
+def test_a_vehicle_stopped_on_a_crossing_goes_before_vehicles_that_can_wait():
     inside, comes = {"line": -5.0, "yielding": 1.0}, {"front": -25.0, "v": 9.0}
-    assert not meeting(inside, comes, prio=-1)() and meeting(inside, comes, prio=-1)(blocks=(True, False))
-    assert not meeting(inside, comes, prio=-1)(blocks=(True, True))
-    # but not before who can no longer stop, or only in haste
-    assert not meeting(inside, comes | {"front": 4.0, "v": 4.0}, prio=-1)(blocks=(True, False))
-    assert not meeting(inside, comes | {"front": 7.0}, prio=-1)(blocks=(True, False))
+    assert not meeting(inside, comes, prio=-1)() and meeting(inside, comes, prio=-1)(
+        obstructing=(True, False)
+    )
+    assert not meeting(inside, comes, prio=-1)(obstructing=(True, True))
+    # but not before a vehicle that can no longer stop, or only in haste
+    assert not meeting(inside, comes | {"front": 4.0, "v": 4.0}, prio=-1)(obstructing=(True, False))
+    assert not meeting(inside, comes | {"front": 7.0}, prio=-1)(obstructing=(True, False))
 
 
-def test_who_circulates_does_not_brake_hard_for_who_is_gone_before_it_comes():
-    """A ring whose lanes pass exits and entries: somebody enters 30 m ahead, in a gap of 4 s."""
+def test_circulating_traffic_does_not_brake_hard_for_vehicles_that_are_gone_in_time():
+    """A ring whose lanes pass exits and entries: a vehicle enters 30 m ahead, in a gap of 4 s."""
     network, lane_map = bundled("roundabout")
     rows = lane_rows(network)
     routes = lane_map.routes
@@ -168,7 +172,7 @@ def rows_of(line, n):
 
 
 def test_yellow_is_a_dilemma_that_the_braking_decides():
-    """Stop at yellow if 3 m/s^2 were enough when it began; who would have had to brake harder drives on."""
+    """Vehicles stop at yellow if 3 m/s^2 were enough when it began; others drive on."""
     n = 300
     rng = np.random.default_rng(0)
     v, line, since = rng.uniform(3, 16, n), rng.uniform(1, 60, n), rng.uniform(0, 3, n)
@@ -186,13 +190,13 @@ def test_yellow_is_a_dilemma_that_the_braking_decides():
     late = 2 * then > 2.5 * (v + 20)
     could = v * v / (2 * then) <= np.where(late, 4.5, 3.0)
     needed = v * v / (2 * line)
-    # who has come so near without braking for the light drives on
+    # a vehicle that has come near without braking for the light drives on
     np.testing.assert_array_equal(stops(SignalState.YELLOW), could & (needed <= 5.0))
     assert (could & (needed > 5.0)).any()
     np.testing.assert_array_equal(stops(SignalState.RED), needed <= 0.9 * 8)
     assert not stops(SignalState.GREEN_MAJOR).any() and not stops(SignalState.OFF).any()
     assert stops(SignalState.RED_YELLOW)[v < 4].any()
-    # who brakes was faster: what it could do then counts, and it goes on while its own b is enough
+    # a braking vehicle was faster: what it could do then counts; it goes on braking while its b is enough
     b = rng.uniform(2, 8, n).astype(np.float32)
     driver = dataclasses.replace(state.driver, b=jnp.asarray(b))
     braking = dataclasses.replace(state, a=jnp.full(n, -1.5), driver=driver)
@@ -202,14 +206,14 @@ def test_yellow_is_a_dilemma_that_the_braking_decides():
     could = (v_then**2 / (2 * then) <= np.where(late, 4.5, 3.0)) & (needed <= 5.0)
     np.testing.assert_array_equal(stops(SignalState.YELLOW, braking), could | (needed <= b))
     assert (could & (needed > b)).any() and (~could & (needed <= b)).any()
-    # who clears the junction goes before who has green from the side, but not before who still comes
+    # a vehicle that clears the junction goes before those with green from the side, but only at red
     inside = rows._replace(line=jnp.full((n, 2), -3.0))
     for light, priority in ((SignalState.YELLOW, 0), (SignalState.RED, 2)):
         _, major = stops_at_lights(state, inside, speed, jnp.full(4, int(light)), shown)
         assert (np.asarray(major) == priority).all()
 
 
-def test_who_stops_at_yellow_goes_on_stopping():
+def test_a_vehicle_that_stops_at_yellow_goes_on_stopping():
     """Braking evenly, however fast it was, however slow it has become, and late in a long yellow."""
     v, line = (x.ravel() for x in np.meshgrid(np.linspace(5, 30, 26), np.linspace(5, 160, 32)))
     brake = v * v / (2 * line)
@@ -238,7 +242,7 @@ def approaches(turn, foe):
 
 
 def obstacles_of(net, places, length):
-    """The obstacles of vehicles at (lane, s, v), in their order, `[N, K]`: who, and how far."""
+    """The obstacles of vehicles at (lane, s, v), in their order, `[N, K]`: slots and gaps."""
     lane_map, row = build_lane_map(net), lane_rows(net)
     lane, s, v = zip(*places, strict=True)
     lane = np.array([row[name] for name in lane])
@@ -260,7 +264,7 @@ def test_only_long_vehicles_wait_for_each_other_where_turns_pass_back_to_back():
         assert int((np.asarray(gap)[:, 3] < 1e5).sum()) == waits, length
 
 
-def test_a_queue_on_a_merge_does_not_hide_who_comes_behind_it():
+def test_a_queue_on_a_merge_does_not_hide_vehicles_behind_it():
     into = {"junction": "J", "successors": ("out",)}
     lanes = [
         straight("a", (-160, 0), 0.0, 40.0, successors=("main",)),
@@ -283,7 +287,7 @@ def test_a_queue_on_a_merge_does_not_hide_who_comes_behind_it():
     assert float(found.gap[0, 2]) == pytest.approx(s_out - s_in + 0.3 - (f_out - f_in) + 2.0, abs=0.01)
 
 
-def test_who_ends_its_way_does_not_run_into_who_has_just_driven_on():
+def test_a_vehicle_at_its_goal_does_not_run_into_one_that_has_just_left():
     lanes = [straight("in", (0, 0), 0.0, 50.0, successors=("left", "right"))]
     lanes += [curve(name, (50, 0), 0.0, (80, y), 0.0) for name, y in (("left", 12), ("right", -12))]
     net = network(lanes)
@@ -339,7 +343,7 @@ def test_actuated_green_lasts_while_vehicles_come():
     lane = jnp.asarray([[int(np.nonzero(green)[0][0])]])
 
     def length(seen_until):
-        """s of the first phase with somebody at the detector up to then."""
+        """s of the first phase with a vehicle at the detector up to then."""
         state = state_of("intersection", [0], [5.0], [5.0], [0])
         for k in range(200):
             here = jnp.full((1, 1), 10.0 if k * 0.5 <= seen_until else DETECTOR + 1)
@@ -350,9 +354,9 @@ def test_actuated_green_lasts_while_vehicles_come():
         raise AssertionError("the phase never ends")
 
     jitted = jax.jit(functools.partial(switch, CONFIG, lane_map))
-    assert length(-1) == pytest.approx(5.0, abs=0.51)  # nobody: the least
+    assert length(-1) == pytest.approx(5.0, abs=0.51)  # no vehicle: the least
     assert length(12.0) == pytest.approx(12.0 + GAP, abs=1.01)
-    assert length(1e9) == pytest.approx(30.0, abs=0.51)  # always somebody: the most
+    assert length(1e9) == pytest.approx(30.0, abs=0.51)  # always a vehicle: the most
 
 
 @functools.cache
@@ -396,8 +400,8 @@ def straight_on(lane_map):
     return [(int(before[lane]), goal) for goal, lane in found.items()]
 
 
-def test_four_who_arrive_together_all_get_across():
-    """Right before left is a circle of four: somebody has to begin, and all are through in 20 s."""
+def test_four_vehicles_that_arrive_together_all_get_across():
+    """Right before left is a circle of four: one has to begin, and all are through in 20 s."""
     lane_map, _ = without_lights()
     ways = straight_on(lane_map)
     assert len(ways) == 4
@@ -406,11 +410,11 @@ def test_four_who_arrive_together_all_get_across():
     state = state_of("intersection", lanes, s, [9.0] * 4, goals, driver=drivers(4))
     end, (lane, _, v, box, _) = runner(False, 44)(state)
     inside = np.asarray(lane_map.is_connector)[np.asarray(lane)]
-    assert inside.any(0).all(), "everybody enters"
+    assert inside.any(0).all(), "all enter"
     gone = ~inside[-1] & inside.any(0)
-    assert gone.all(), "and is through"
+    assert gone.all(), "and are through"
     assert int(np.asarray(end.status).max()) == 0
-    assert np.asarray(v).min() < 6.0, "somebody had to slow down for the others"
+    assert np.asarray(v).min() < 6.0, "some had to slow down for the others"
     assert np.isfinite(np.asarray(box)).all()
 
 
@@ -435,7 +439,7 @@ def test_red_lights_are_obeyed_and_green_discharges_the_queue():
     )
     end, (at, s, v, _, _) = runner(True, 240)(state)
     at, s, v = np.asarray(at), np.asarray(s), np.asarray(v)
-    assert not (np.asarray(end.status) & 8).any(), "nobody runs the red light"
+    assert not (np.asarray(end.status) & 8).any(), "no vehicle runs the red light"
     crossed = np.asarray(lane_map.is_connector)[at]
     times = np.array([np.argmax(crossed[:, i]) for i in range(n)]) * 0.1
     assert crossed.any(0).all() and (np.diff(times) > 0).all()

@@ -37,7 +37,7 @@ let_in = jax.jit(enter, static_argnums=0)
     ],
 )
 def test_shared_sumo_demands(folder, rows, notes):
-    """Everybody departs in time on the first edge of the own route; what is not used is said."""
+    """All vehicles depart in time on the first edge of their routes; notes say what is not used."""
     path = SHARED / "sumo" / folder
     network = read_network(next(path.glob("*.net.xml")), cache=False)
     demand = read_demand(sorted(path.glob("*.rou.xml")), network)

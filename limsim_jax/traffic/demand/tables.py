@@ -71,7 +71,7 @@ class Tables:
         )
 
     def leaves_room(self, row: Any, s: Any) -> NDArray[np.bool_]:
-        """Goals with room to change lanes from `s` (m) of `row`, `[*b, G]`."""
+        """Goals `[*b, G]` with room to change lanes from `s` (m)."""
         room = self.change_distance[row] - np.asarray(s)[..., None]
         per_lane = np.maximum(CHANGE_ROOM, CHANGE_TIME * self.speed_limit[row])[..., None]
         return self.reachable[row] & (room > per_lane * np.abs(self.lanes_to_go[row]))
