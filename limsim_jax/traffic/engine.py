@@ -261,12 +261,12 @@ def _speeds(
     v0 = desired_speed(driver, lane_map.speed_limit[state.lane], curvature(lane_map, state.lane, state.s))
     v0 = jnp.minimum(v0, _until_changed(lane_map, state))
     # lanes to come: limit and tightest bend
-    speed = lane_speed(lane_map, ahead.lane[:, 1:], driver.speed_factor[:, None], driver.a_lat[:, None])
+    speed = lane_speed(lane_map, driver, ahead.lane[:, 1:])
     # the own lane: its bend at a few places within braking distance
     reach = state.v * state.v / driver.b + DRIVING.bend_room
     share = jnp.arange(1, BEND_POINTS + 1, dtype=reach.dtype) / BEND_POINTS
     there = reach[:, None] * share[None, :]
-    own = jnp.sqrt(bend_squares(lane_map, driver, state.lane, state.s[:, None] + there))
+    own = jnp.sqrt(bend_squares(lane_map, driver, state.lane[:, None], state.s[:, None] + there))
     speed = jnp.concatenate([speed, own], -1)
     distance = jnp.maximum(jnp.concatenate([ahead.start[:, 1:], there], -1), 0)
     first = jnp.argmin(speed * speed + driver.b[:, None] * distance, -1)[:, None]

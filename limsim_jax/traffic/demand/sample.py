@@ -209,7 +209,7 @@ def entry_speed(
     brake = 2 * driver.b
     share = jnp.arange(1, BEND_POINTS + 1, dtype=speed.dtype)[None] / BEND_POINTS
     reach = jnp.minimum(square / brake, lane_map.length[lane] - s)
-    slow = bend_squares(lane_map, driver, lane, s[:, None] + reach[:, None] * share)
+    slow = bend_squares(lane_map, driver, lane[:, None], s[:, None] + reach[:, None] * share)
     square = jnp.minimum(square, (slow + (brake * reach)[:, None] * share).min(-1))
     start = -s
     for _ in range(_LOOK):
@@ -220,7 +220,7 @@ def entry_speed(
         stop = jnp.where(lane_map.is_connector[after] & ~lane_map.is_connector[lane], stop, _FAR)
         stop = jnp.minimum(stop, jnp.where(dead_end, end - _DEAD_END_ROOM, _FAR))
         square = jnp.minimum(square, brake * jnp.maximum(stop, 0))
-        slow = lane_speed(lane_map, after, driver.speed_factor, driver.a_lat)
+        slow = lane_speed(lane_map, driver, after)
         square = jnp.minimum(square, slow * slow + brake * jnp.maximum(end, 0))
         lane, start = after, end
     return safe_sqrt(square)
