@@ -245,7 +245,7 @@ def _constant_acceleration_heuristic(
     return jnp.where(leader_stops, stopping, a_lead - closing * closing / (2 * s))
 
 
-def safe_speed(driver: Driver, gap: Float[Array, " N"], v_lead: Float[Array, " N"]) -> Float[Array, " N"]:
+def safe_speed(driver: Driver, gap: Values, v_lead: Values) -> Float[Array, "*b"]:
     """Largest speed (m/s) that lets a driver stop s0 behind the leader.
 
     The driver reacts after T and brakes with b. Gipps (1981), Transp. Res. B 15, 105, eq. 8, for a

@@ -33,7 +33,7 @@ class Tables:
     widths: NDArray[np.float64]  # [Y] m, of the widest vehicle of a type
     allowed: NDArray[np.bool_]  # [L, Y] types on lanes
     reachable: NDArray[np.bool_]  # [L, G]
-    lanes_to_go: NDArray[np.int_]  # [L, G]
+    lanes_to_go: NDArray[np.int32]  # [L, G]
     change_distance: NDArray[np.float64]  # [L, G] m
     speed_limit: NDArray[np.float64]  # [L] m/s
 
