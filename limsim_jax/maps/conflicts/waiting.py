@@ -23,9 +23,9 @@ def waiting_points(
 ) -> list[float]:
     """Where traffic can wait inside the junction.
 
-    The point lies `before` m ahead of the first conflict with a foe that has priority, and `at_least` m
-    into the junction. The file names the movements that have one. In a file that names none, every turn
-    across opposing traffic has one.
+    The point lies `before` m ahead of the first conflict with a foe that has priority, and no less than
+    `at_least` m into the junction. The file names the movements that have one. In a file that names none,
+    every turn across opposing traffic has one.
 
     Returns:
         Arc length (m) from the start of each connector, 0 for nowhere.
