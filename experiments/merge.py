@@ -1,12 +1,12 @@
-"""Who does not find a gap: an on-ramp with a short acceleration lane, and an exit, next to SUMO.
+"""Merging and exiting on a motorway, next to SUMO.
 
     python experiments/merge.py [--worlds 64] [--length 200] [--ramp 1200]
 
-Three lanes of a motorway with 120 km/h, and vehicles that have to get onto them, or off, within `--length` m:
-`on` from a ramp at 80 km/h over an acceleration lane, `off` over a deceleration lane to such a ramp. The flow
-on the motorway grows from row to row. Both simulators read the same network, with the same flows and their
-own default drivers. Counted are those who have to change lanes, and how many of them come to a stand before
-they have done so, or never do. Writes experiments/results/merge.json and .md. Needs `eclipse-sumo`.
+A motorway of three lanes with 120 km/h. Vehicles have to enter it (`on`) from a ramp with 80 km/h over an
+acceleration lane of `--length` m without a taper, or leave it (`off`) over a deceleration lane. The flow on
+the motorway grows from row to row. Both simulators read the same network, with the same flows and their own
+default drivers. The table counts vehicles that have to change lanes, those that stop before they have done
+so, and those that never do. Writes experiments/results/merge.json and .md. Needs `eclipse-sumo`.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def ours(net: Path, demand: list[tuple[str, str, float]], worlds: int) -> dict[s
 
 
 def theirs(net: Path, demand: list[tuple[str, str, float]], worlds: int) -> dict[str, Any]:
-    """SUMO's; who missed is whom it teleports from a wrong lane."""
+    """SUMO's traffic; vehicles that it teleports from a wrong lane have missed."""
     import libsumo  # pyright: ignore[reportMissingImports]
 
     lines = [
@@ -186,7 +186,7 @@ def main() -> None:
         if not getattr(options, name) >= least:
             parser.error(f"--{name.replace('_', '-')} {getattr(options, name):g}: at least {least}")
     if options.ramp > min(MOTORWAY):
-        parser.error(f"--ramp {options.ramp:g}: at most {min(MOTORWAY):g}, who leaves was on the motorway")
+        parser.error(f"--ramp {options.ramp:g}: at most {min(MOTORWAY):g}, the least flow on the motorway")
     if not find_spec("sumo") or not find_spec("libsumo"):
         parser.error("SUMO is missing: pip install eclipse-sumo libsumo")
     use_all_cores()

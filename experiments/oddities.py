@@ -1,9 +1,9 @@
-"""What somebody who watches the traffic would find odd, counted: jumps, slides, hard braking, idle stands.
+"""Oddities of the traffic, counted: jumps, slides, hard braking, idle stops.
 
     python experiments/oddities.py [--worlds 12] [--map NAME_OR_FILE ...]
 
-Background traffic of three minutes per world, every physics step of it. Prints where and when the first few
-of each kind are, to be looked at with `limsim-jax run MAP --seed N --video FILE` and the flows of
+Three minutes of background traffic per world, every physics step. Prints where and when the first few of
+each kind are; look at them with `limsim-jax run MAP --seed N --video FILE` and the flows of
 `soundness.py`. Writes experiments/results/oddities.json and .md; maps that are not named keep their rows.
 """
 
@@ -36,13 +36,13 @@ KINDS = {
     "jumps": "a body moves 0.25 m more or less than its speed tells",
     "slides": "a body moves 0.25 rad off its heading",
     "hard": "begins to brake with more than 5 m/s^2",
-    "stands": "stands for 10 s, not at a line, for nobody within 10 m, and not for the right of way",
+    "stands": "stands for 10 s without a line, a vehicle within 10 m ahead, or another right of way",
 }
 SHOWN = 3
 
 
 class Seen(NamedTuple):
-    """A step, as far as it is looked at."""
+    """What is recorded of a step."""
 
     box: Float[Array, "N 5"]
     active: Bool[Array, " N"]
@@ -55,7 +55,7 @@ class Seen(NamedTuple):
 
 
 def odd(lane_map: LaneMap, seen: Seen) -> dict[str, Bool[np.ndarray, "T N"]]:
-    """Where each kind begins, `[T, N]` steps and slots."""
+    """Steps and slots at which each kind begins, `[T, N]`."""
     box, v = seen.box, seen.v
     same = seen.active[1:] & seen.active[:-1] & (seen.vehicle[1:] == seen.vehicle[:-1])
     dx, dy = (np.diff(box[..., k], axis=0) for k in range(2))
@@ -94,14 +94,14 @@ def watch(name: str, worlds: int) -> dict[str, Any]:
     )
     slots = SLOTS.get(name, 64)
 
-    def record(lane_map: LaneMap) -> Any:
-        def look(tick: Tick) -> Seen:
+    def recorder(lane_map: LaneMap) -> Any:
+        def record(tick: Tick) -> Seen:
             x = tick.state
             return Seen(boxes(lane_map, x), x.active, x.vehicle, x.lane, x.s, x.v, x.a, x.yielding)
 
-        return look
+        return record
 
-    run = Rollout(Config(dt=DT), Traffic(), HORIZON, record=record)
+    run = Rollout(Config(dt=DT), Traffic(), HORIZON, record=recorder)
     go = jax.jit(
         lambda seed: one_world(run, lane_map, lambda key: sample_scenario(demand, lane_map, key, slots), seed)
     )

@@ -1,4 +1,7 @@
-"""A platoon on one lane in our engine and in SUMO, step by step; part of `traffic_against_sumo.py`."""
+"""A platoon on one lane, in our engine and in SUMO.
+
+Part of `traffic_against_sumo.py`.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ STOP_AND_GO = (
     (12, 1.25), (20, 0), (3, -2), (3, 2), (3, -2), (3, 2), (10, 0), (2, -7), (5, 0), (1, -1), (30, 0),
     (10, 1.2), (15, 0), (15, -0.8), (20, 0), (6, 2), (30, 0),
 )  # fmt: skip
-"""What the leader does: for so many s an acceleration of so many m/s^2."""
+"""What the leader does: durations (s) and accelerations (m/s^2)."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,7 @@ def road_xml() -> str:
 
 
 class Ride(NamedTuple):
-    """Way and speed of every vehicle of a platoon after every step, `[T, N]`."""
+    """Distance and speed of every vehicle after every step, `[T, N]`."""
 
     x: NDArray[np.float64]  # m, front bumper from the start of the road
     v: NDArray[np.float64]  # m/s

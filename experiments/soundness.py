@@ -1,9 +1,9 @@
-"""Many random episodes of background traffic on many maps, and what went wrong in them.
+"""Random episodes of background traffic on many maps, and their faults.
 
     python experiments/soundness.py [--episodes 1920] [--town-episodes 192] [--map NAME_OR_FILE ...]
 
-Every episode has other vehicles at the start, other arrivals, drivers and goals. By default on the bundled
-maps, and on CARLA's towns where the folder of real maps is there. Writes
+Vehicles at the start, arrivals, drivers and goals differ from episode to episode. The default maps are the
+bundled ones, and CARLA's towns where the folder of real maps exists. Writes
 experiments/results/soundness.json and .md; maps that are not named keep their rows.
 """
 
@@ -48,55 +48,55 @@ TOWNS = sorted((SHARED / "opendrive").glob("carla_*.xodr"))
 INITIAL, IN_TOWN = 20, 50  # vehicles at the start, about
 IN_SMALL_TOWN = {"carla_legacy_town02": 25}  # a grid of single lanes, 5.7 km of them
 HORIZON = 180.0  # s
-RANK = np.zeros(len(SignalState), np.int32)  # by what a light shows; who is inside at red clears first
+RANK = np.zeros(len(SignalState), np.int32)  # by what a light shows; at red, vehicles inside clear first
 RANK[[SignalState.RED, SignalState.YELLOW, SignalState.RED_YELLOW]] = 2
 RANK[SignalState.GREEN_MAJOR] = 1
 RANK[[SignalState.GREEN_MINOR, SignalState.STOP]] = -1
 STANDS = 0.1  # m/s, below which SUMO counts a vehicle as waiting
-NOSE = 0.5  # m, by which who stops to yield may be too far
+NOSE = 0.5  # m, by which a vehicle that stops to yield may stand too far
 
 
 class Changes:
-    """Who has to change lanes for its goal, who of these stands before that is done, who never does it.
+    """Lane changes that routes need: by how many vehicles, after a stop, or never.
 
-    A `rollout.Measure`; everybody counts once.
+    A `simulation.rollout.Measure`; every vehicle counts once.
     """
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
-        """Nobody is there yet."""
-        nobody = jnp.zeros((3, *state.active.shape), bool)
-        return state.entered, nobody, jnp.zeros(3, jnp.int32)
+        """The count before any vehicle is seen."""
+        none = jnp.zeros((3, *state.active.shape), bool)
+        return state.entered, none, jnp.zeros(3, jnp.int32)
 
-    def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
-        """Who is in each slot after a step, and which of the three it is."""
+    def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
+        """The vehicle in each slot, and which of the three it does."""
         state = tick.state
         must = lane_map.routes.lanes_to_go[state.lane, state.goal] != 0
         missed = (state.status & int(Status.MISSED_ROUTE)) != 0
         each = jnp.stack([must, must & (state.v < STANDS), missed])
         return jnp.where(state.active, state.entered, -1), state.active & each
 
-    def update(self, config: Config, lane_map: LaneMap, carry: Any, looks: Any) -> Any:
-        """Counts who was not known."""
+    def update(self, config: Config, lane_map: LaneMap, carry: Any, records: Any) -> Any:
+        """Count vehicles that were not counted before."""
 
-        def step(carry: Any, look: Any) -> tuple[Any, None]:
-            who, known, counts = carry
-            known &= who == look[0]
-            counts += jnp.sum(look[1] & ~known, -1, dtype=jnp.int32)
-            return (look[0], known | look[1], counts), None
+        def step(carry: Any, record: Any) -> tuple[Any, None]:
+            vehicle, known, counts = carry
+            known &= vehicle == record[0]
+            counts += jnp.sum(record[1] & ~known, -1, dtype=jnp.int32)
+            return (record[0], known | record[1], counts), None
 
-        return jax.lax.scan(step, carry, looks)[0]
+        return jax.lax.scan(step, carry, records)[0]
 
     def result(self, config: Config, lane_map: LaneMap, carry: Any) -> Any:
-        """How many: have to, stood, never did."""
+        """Numbers of vehicles: have to change, stopped before, never did."""
         return carry[-1]
 
 
 class Watch:
-    """What totals do not tell, a `rollout.Measure`. Counts of
+    """Crossing conflicts, those against priority, and `Changes`: a `simulation.rollout.Measure`.
 
-    pairs that are in a stretch where their lanes cross at the same time: where centre lines are within
-    2.3 m, so they may be in it without touching; of these, pairs against priority: who has to yield, by the
-    lights or else by the map, drives, more than `NOSE` inside; and `Changes`.
+    A crossing conflict is a pair of vehicles inside the stretch where their lanes are less than 2.3 m apart,
+    so they need not touch. It is against priority if the vehicle that must yield (by signal, otherwise by the
+    map) moves there, more than `NOSE` inside.
     """
 
     def __init__(self, table: ConflictTable) -> None:
@@ -110,7 +110,7 @@ class Watch:
             self.mirror[k, c] = j * foe.shape[1] + int(np.argmax(same))
 
     def _pairs(self, lane_map: LaneMap, state: State) -> tuple[jax.Array, jax.Array]:
-        """Entries of the table `[K, C]` with somebody on either side, and those against priority."""
+        """Entries `[K, C]` with vehicles on both sides, and those against priority."""
         table = lane_map.conflicts
         behind, front = tails(lane_map, state)
         lane = jnp.concatenate([jnp.where(state.active, state.lane, NO_LANE)[:, None], behind], -1)
@@ -130,26 +130,26 @@ class Watch:
         return both, against | against.ravel()[self.mirror]
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
-        """Nobody has met yet."""
+        """The count before any vehicles meet."""
         met = jnp.zeros(2, jnp.int32)
         return self._pairs(lane_map, state), met, self.changes.init(config, lane_map, state)
 
-    def look(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
-        """Who is together after a step, and who has to change lanes."""
-        return self._pairs(lane_map, tick.state), self.changes.look(config, lane_map, tick)
+    def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
+        """Pairs after a step, and the record of `Changes`."""
+        return self._pairs(lane_map, tick.state), self.changes.record(config, lane_map, tick)
 
-    def update(self, config: Config, lane_map: LaneMap, carry: Any, looks: Any) -> Any:
-        """Counts pairs when they begin, and vehicles once."""
-        (before, met, changes), (pairs, whose) = carry, looks
+    def update(self, config: Config, lane_map: LaneMap, carry: Any, records: Any) -> Any:
+        """Count pairs when they begin, and vehicles once."""
+        (before, met, changes), (pairs, vehicles) = carry, records
         begun = [
             jnp.sum(x & ~jnp.concatenate([y[None], x[:-1]]), dtype=jnp.int32) // 2
             for x, y in zip(pairs, before, strict=True)
         ]
         last = jax.tree.map(lambda x: x[-1], pairs)
-        return last, met + jnp.stack(begun), self.changes.update(config, lane_map, changes, whose)
+        return last, met + jnp.stack(begun), self.changes.update(config, lane_map, changes, vehicles)
 
     def result(self, config: Config, lane_map: LaneMap, carry: Any) -> Any:
-        """Pairs together, of these against priority, and what `Changes` has counted."""
+        """Crossing conflicts, of these against priority, and the counts of `Changes`."""
         return jnp.concatenate([carry[1], self.changes.result(config, lane_map, carry[-1])])
 
 
@@ -209,7 +209,7 @@ COLUMNS = {
     "off_road": "off road",
     "wrong_way": "wrong way",
     "ran_red": "red light",
-    "together": "two where lanes cross",
+    "together": "crossing conflicts",
     "against_priority": "of these against priority",
     "must_change": "have to change lanes",
     "missed": "never did",
@@ -228,7 +228,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def check_maps(parser: argparse.ArgumentParser, names: list[str]) -> None:
-    """Ends the program where one of them is neither a file nor a bundled map."""
+    """End the program unless every name is a file or a bundled map."""
     for name in names:
         if not Path(name).exists() and name not in bundled_maps():
             parser.error(f"--map {name}: no such file, nor one of {', '.join(bundled_maps())}")

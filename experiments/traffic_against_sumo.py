@@ -3,7 +3,7 @@
     python experiments/traffic_against_sumo.py [--network NAME ...] [--seeds 3] [--seconds 1800]
 
 Needs `libsumo` and the shared data. Writes experiments/results/traffic_against_sumo.json and .md; what the
-differences come from stands in `EXPLAINED`.
+differences come from is explained in `EXPLAINED`.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ COMMAND = "python experiments/traffic_against_sumo.py"
 
 
 class Case(NamedTuple):
-    """A network of the shared data, its demand, and how many vehicle slots that takes."""
+    """A network of the shared data, its demand and number of slots."""
 
     files: tuple[str, ...]
     slots: int
     begin: float = 0.0  # s, time of the files
-    every: int = 1  # of so many vehicles one drives
+    every: int = 1  # one vehicle of this number drives
     programs: str | None = None  # file with signal programs that replace those of the network
 
 
@@ -112,12 +112,12 @@ def lights(network: Network) -> dict[str, Light]:
 
 
 def is_free(light: Light, state: str) -> bool:
-    """Whether all on the lane may go and need not yield to anybody."""
+    """Whether all vehicles on the lane may go and need not yield."""
     return all(state[i] in "Gg" for i in light.links) and all(state[i] not in "Gg" for i in light.foes)
 
 
 def is_closed(light: Light, state: str) -> bool:
-    """Whether nobody on the lane may go."""
+    """Whether no vehicle on the lane may go."""
     return all(state[i] in "ru" for i in light.links)
 
 
@@ -131,7 +131,7 @@ class Green(NamedTuple):
 
 
 def discharge(greens: Sequence[Green], passages: dict[str, list[float]]) -> tuple[list[float], list[float]]:
-    """Headways (s) at the stop line from the fourth vehicle of a queue on, and times of the first one."""
+    """Discharge headways (s) from the fourth vehicle on, and times of the first."""
     headways, first = [], []
     for green in greens:
         times = [t for t in passages.get(green.lane, []) if green.start < t <= green.end][: green.queue]
@@ -141,7 +141,7 @@ def discharge(greens: Sequence[Green], passages: dict[str, list[float]]) -> tupl
 
 
 def sumo_files(folder: Path, case: Case, keep: Sequence[str], out: Path, *, idm: bool) -> list[Path]:
-    """The demand as SUMO reads it, but only the vehicles that drive in ours, and without stops."""
+    """SUMO's demand with only the vehicles that drive in ours, without stops."""
     kept, files = set(keep), []
     for name in case.files:
         tree = ElementTree.parse(folder / name)
@@ -258,7 +258,10 @@ class _Watch:
             self.by_program[light.program].append(lane)
 
     def look(self, now: float, states: dict[str, str], queue: Any) -> None:
-        """Take the states of all programs at a time (s); `queue(lane)` counts who stands on a lane."""
+        """Take the states of all programs at a time (s).
+
+        `queue(lane)` counts vehicles that stand on a lane.
+        """
         for program, state in states.items():
             if self.before.get(program) == state:
                 continue
@@ -279,7 +282,7 @@ class _Watch:
 
 @dataclass(frozen=True)
 class Either:
-    """IDM for drivers without coolness, else ACC-IDM: one program for worlds of both kinds."""
+    """IDM for drivers without coolness, ACC-IDM for others: one program for both."""
 
     def __call__(self, driver: Driver, **seen: Any) -> Any:
         """Acceleration, m/s^2."""
@@ -359,7 +362,7 @@ def run_ours(
 
 
 class _Observer:
-    """Measures one of our worlds, step by step, with the definitions that `run_sumo` has."""
+    """Measures one of our worlds with the definitions of `run_sumo`."""
 
     def __init__(self, network: Network, lane_map: LaneMap, lit: dict[str, Light], due: NDArray[Any]) -> None:
         rows = lane_rows(network)
@@ -433,7 +436,7 @@ class _Observer:
 
 
 def merged_net(net: Path, programs: Path | None, out: Path) -> Path:
-    """The network with the signal programs of another file instead of its own."""
+    """The network with the signal programs of another file."""
     if programs is None:
         return net
     tree = ElementTree.parse(net)
@@ -541,34 +544,32 @@ pasubio_tls.add.xml and every fourth vehicle.
   float32, 2 km from the origin of the map, and its followers keep their distance to it.
 - First vehicle after green: with steps of 1 s a driver starts a step later, and Krauss dawdles; IDM drivers
   of both simulators start at once.
-- Turns: SUMO drives through junctions with the speed that the network gives (5.5 m/s^2 across), ours with
-  what the driver accepts (2.5 m/s^2, on average). Turning queues discharge slower, and so do lanes that
-  are led sideways within a few metres of a junction (104012170 of ingolstadt1).
-- Lane changes take no time and no way in SUMO. Ours take 3 to 7 s and 22 m at least, so that edges shorter
-  than that hardly serve: on those below 10 m nobody counts on a change, and whoever is on the wrong lane
-  there, or on one a little longer, takes another way (edge 164051413 of ingolstadt1, 8.9 m; edge -28 of
-  limsim_town05, 27 m). Turns are then missed that SUMO's drivers make.
+- Turns: in SUMO the network gives the speed in junctions (5.5 m/s^2 across). Ours drive with what the driver
+  accepts (2.5 m/s^2 on average). Turning queues discharge slower, and so do lanes that shift sideways within
+  a few metres of a junction (104012170 of ingolstadt1).
+- Lane changes take no time and no distance in SUMO. Ours take 3 to 7 s and at least 22 m, so shorter edges
+  hardly serve for them. Below 10 m no vehicle counts on a change. A vehicle on the wrong lane there, or on a
+  lane a little longer, takes another route (edge 164051413 of ingolstadt1, 8.9 m; edge -28 of limsim_town05,
+  27 m). It then misses turns that SUMO's drivers make.
 - Gaps: ours enter a crossing with a critical gap of about 6 s, as Siegloch's formula has it for turns from
-  minor roads; SUMO's go when they are clear a second before the other comes. Minor arms discharge slower
-  (391891458 of ingolstadt1: the queue behind it is what waits outside).
+  minor roads. SUMO's drivers go if they are clear a second before the other arrives. Minor arms discharge
+  slower (391891458 of ingolstadt1: the queue behind it is what waits outside).
 - SUMO's drivers choose the lane that leads on farthest, and so use all lanes of the roundabout. Ours stay on
   the lane of their exit, four fifths of them on the outermost, and wait for one another.
-- limsim_bigInter jams in some runs of ours when vehicles that have entered on a gap meet others inside:
-  seven of them then stand with their noses in each other's ways. SUMO's drivers do so as well, and are
-  teleported.
+- limsim_bigInter jams in some of our runs, when vehicles that have entered on a gap meet others inside: seven
+  of them then block each other. This happens to SUMO's drivers as well, and SUMO teleports them.
 - ingolstadt1 and limsim_town05 count as gridlocked as soon as one vehicle stands for 120 s, which happens
   in minor arms, behind long red phases and missed turns; traffic as a whole goes on.
-- SUMO looks for collisions along lanes. Ours compares bodies, so it also finds those who touch beside
-  one another where lanes come close: side by side on the two lanes of 1200363973 in ingolstadt1, which are
-  led 3 m sideways within 8 m, and where vehicles of 12 m turn beside others (4_6 and 29_0 of
-  bologna_pasubio). Whom the bodies leave no room goes one after the other there: queues on 1200363973
-  discharge slower than on lanes that drivers share.
-- Vehicles that stand for 300 s are teleported by SUMO. Ours stay, and hold up all behind them.
+- SUMO looks for collisions along lanes. Ours compares bodies, so it also finds vehicles that touch side by
+  side where lanes come close: on the two lanes of 1200363973 in ingolstadt1, which shift 3 m sideways within
+  8 m, and where vehicles of 12 m turn beside others (4_6 and 29_0 of bologna_pasubio). Where bodies have no
+  room side by side, vehicles go one after the other: queues on 1200363973 discharge slower.
+- SUMO teleports vehicles that stand for 300 s. Ours stay, and block the vehicles behind them.
 """
 
 
 def _spread(of_runs: Sequence[float | None], digits: int) -> str:
-    """Mean and standard deviation; runs in which nobody arrived have no travel time."""
+    """Mean and standard deviation; runs without arrivals have no travel time."""
     values = [x for x in of_runs if x is not None]
     if not values:
         return "none arrived"
@@ -642,7 +643,7 @@ def main() -> None:
 
 
 def _brief(table: Any) -> Any:
-    """The same with number, 10th, 50th and 90th percentile in place of lists of numbers."""
+    """Replace lists of numbers by their count and 10th, 50th, 90th percentile."""
     if isinstance(table, dict):
         return {key: _brief(value) for key, value in table.items()}
     if isinstance(table, list) and table and all(isinstance(x, float) for x in table):
@@ -677,8 +678,8 @@ def _document(table: dict[str, Any]) -> list[str]:
         f"Means over {table['seeds']} seeds ± their standard deviation. Vehicles that collide drive on.",
         "",
         "Discharge headway: median (10th to 90th percentile) at the stop line from the fourth vehicle of a",
-        f"queue on. The queue: who is slower than {QUEUED:.0f} m/s on a lane when its light turns green for",
-        "all on it, and nobody there has to yield.",
+        f"queue on. The queue: vehicles below {QUEUED:.0f} m/s on a lane when its light turns green for all",
+        "on it, where no vehicle has to yield.",
         "",
     ]
     for name, result in table["networks"].items():

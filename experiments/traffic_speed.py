@@ -1,4 +1,6 @@
-"""How fast traffic runs on this machine, next to SUMO on the same maps with the same flows.
+"""Speed of the traffic on this machine, next to SUMO.
+
+On the same maps with the same flows.
 
     python experiments/traffic_speed.py [--worlds 256] [--seconds 60]
 
