@@ -209,7 +209,7 @@ COLUMNS = {
     "off_road": "off road",
     "wrong_way": "wrong way",
     "ran_red": "red light",
-    "together": "crossing conflicts",
+    "together": "two where lanes cross",
     "against_priority": "of these against priority",
     "must_change": "have to change lanes",
     "missed": "never did",
@@ -228,7 +228,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def check_maps(parser: argparse.ArgumentParser, names: list[str]) -> None:
-    """End the program unless every name is a file or a bundled map."""
+    """End the program if a name is no file and no bundled map."""
     for name in names:
         if not Path(name).exists() and name not in bundled_maps():
             parser.error(f"--map {name}: no such file, nor one of {', '.join(bundled_maps())}")

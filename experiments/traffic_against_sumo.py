@@ -131,7 +131,7 @@ class Green(NamedTuple):
 
 
 def discharge(greens: Sequence[Green], passages: dict[str, list[float]]) -> tuple[list[float], list[float]]:
-    """Discharge headways (s) from the fourth vehicle on, and times of the first."""
+    """Discharge headways (s) from the fourth vehicle on, and first times."""
     headways, first = [], []
     for green in greens:
         times = [t for t in passages.get(green.lane, []) if green.start < t <= green.end][: green.queue]

@@ -1,8 +1,8 @@
-"""Table of the default vehicle classes and drivers, with units and sources.
+"""Tables of the parameters of vehicles, drivers and their behaviour, with units and sources.
 
     python experiments/vehicle_table.py
 
-Writes experiments/results/vehicle_parameters.md.
+Writes experiments/results/vehicle_parameters.md and behaviour_parameters.md.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ import math
 from pathlib import Path
 
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES
+from limsim_jax.traffic.parameters import PARAMETERS
 from limsim_jax.traffic.vehicles import CUT, DEFAULTS, HIGHWAY, NORMAL, URBAN, Parameter
 
-RESULT = Path(__file__).parent / "results" / "vehicle_parameters.md"
+RESULTS = Path(__file__).parent / "results"
 
 HEAD = f"""# Vehicles and drivers
 
@@ -27,6 +28,17 @@ vehicle). Parameters without a spread are the same for all. Where a source has o
 and one for trucks, the other classes, all spreads and all correlations are choices of this project.
 `vType` names the attribute of a SUMO vehicle type that replaces the default.
 """
+
+
+BEHAVIOUR = """# Behaviour
+
+Written by `python experiments/vehicle_table.py` from `limsim_jax/traffic/parameters.py`.
+
+These numbers are the same for all vehicles. Those of drivers and bodies are in `vehicle_parameters.md`.
+"Chosen" marks a choice of this project.
+"""
+
+GROUPS = {"JUNCTIONS": "Junctions", "LANE_CHANGES": "Lane changes", "DRIVING": "Driving"}
 
 
 def table() -> str:
@@ -57,7 +69,29 @@ def _row(name: str, parameter: Parameter) -> list[str]:
     return [f"`{name}`", parameter.meaning, unit, *cells, correlation, bounds, attribute, parameter.source]
 
 
+def behaviour_table() -> str:
+    """The page of the behaviour model, as Markdown."""
+    lines = [BEHAVIOUR]
+    for group, title in GROUPS.items():
+        lines += [f"## {title}", "", "| parameter | meaning | value | unit | range | source |"]
+        lines.append("|---|---|---:|---|---|---|")
+        for x in PARAMETERS:
+            if x.group == group:
+                low, high = x.bounds
+                unit = x.unit.replace("^2", "²")
+                cells = f"`{x.name}`", x.meaning, f"{x.value:g}", unit, f"{low:g} to {high:g}", x.source
+                lines.append("| " + " | ".join(cells) + " |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def pages() -> dict[str, str]:
+    """All pages by the names of their files."""
+    return {"vehicle_parameters": table(), "behaviour_parameters": behaviour_table()}
+
+
 if __name__ == "__main__":
-    RESULT.parent.mkdir(exist_ok=True)
-    RESULT.write_text(table(), encoding="utf-8")
-    print(f"wrote {RESULT}")
+    RESULTS.mkdir(exist_ok=True)
+    for name, page in pages().items():
+        (RESULTS / f"{name}.md").write_text(page, encoding="utf-8")
+        print(f"wrote {RESULTS / name}.md")

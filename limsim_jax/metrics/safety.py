@@ -24,12 +24,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.metrics.reductions import Least
 from limsim_jax.numerics import safe_sqrt
+from limsim_jax.traffic.car_following import NO_GAP
 
 NONE = 1e6
 """s: no collision, no conflict."""
-
-NO_GAP = 1e6
-"""m: nobody ahead."""
 
 FORESIGHT = 1000.0
 """s: a contact later than this is none."""
