@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from limsim_jax.files import write_whole
+from limsim_jax.log_replay.arrays import SceneArrays, build_arrays
 from limsim_jax.log_replay.pilot import PolicyPilot
-from limsim_jax.log_replay.scene import Scene, build_scene
 from limsim_jax.log_replay.takeover import Record, as_logged, braking, replay, replay_many
 from limsim_jax.maps import build_lane_map
 from limsim_jax.policies.limsim_tm.policy import LimSimTM
@@ -60,7 +60,7 @@ def platoon(cars: int = 12, seconds: float = 60.0, dt: float = 0.1) -> Tracks:
     )  # fmt: skip
 
 
-def egos_of(scene: Scene, way: tuple[float, float], left: float = 1.0) -> Any:
+def egos_of(scene: SceneArrays, way: tuple[float, float], left: float = 1.0) -> Any:
     """Every vehicle that is there for long enough: `left` s after it has been told."""
     there = np.asarray(scene.last - scene.first) * scene.log.dt
     slots = np.flatnonzero(there > AFTER + left)
@@ -71,7 +71,7 @@ def egos_of(scene: Scene, way: tuple[float, float], left: float = 1.0) -> Any:
 
 def measure(recorded: Tracks) -> list[dict[str, Any]]:
     """Rows of the table for a scene."""
-    scene = build_scene(recorded, build_lane_map(recorded.network))
+    scene = build_arrays(recorded, build_lane_map(recorded.network))
     valid = np.asarray(scene.log.valid)
     counts, moments = jax.jit(lambda s: replay(s, as_logged(s, 0), record=True))(scene)
     same = all(
@@ -111,11 +111,11 @@ def measure(recorded: Tracks) -> list[dict[str, Any]]:
 def driven(recorded: Tracks) -> list[dict[str, Any]]:
     """Planners at the wheel of each vehicle in turn, until its log ends."""
     lane_map = build_lane_map(recorded.network)
-    scene = build_scene(recorded, lane_map)
+    scene = build_arrays(recorded, lane_map)
     egos = egos_of(scene, (0.0, 1e6), DRIVEN)
 
     @jax.jit
-    def run(scene: Scene, egos: Any, pilot: PolicyPilot) -> Any:
+    def run(scene: SceneArrays, egos: Any, pilot: PolicyPilot) -> Any:
         def one(ego: Any) -> Any:
             counts, moments = replay(scene, ego, pilot=pilot, record=True)
             assert moments is not None
@@ -151,7 +151,7 @@ def driven(recorded: Tracks) -> list[dict[str, Any]]:
 
 def benchmark(recorded: Tracks, variants: int) -> dict[str, Any]:
     """Time of many variants of a scene in one program."""
-    scene = build_scene(recorded, build_lane_map(recorded.network))
+    scene = build_arrays(recorded, build_lane_map(recorded.network))
     rng = np.random.default_rng(0)
     number = scene.log.x.shape[1]
     draw = [rng.uniform(*bounds, variants) for bounds in ((1.0, 6.0), (2.0, 8.0), (0.5, 4.0))]

@@ -26,10 +26,11 @@ ORDER = [
     {"policies"},
     {"simulation"},
     {"metrics"},
-    {"sweeps", "calibration", "log_replay"},
+    {"sweeps", "calibration"},
     {"training"},
     {"report", "bridges"},
     {"api"},
+    {"log_replay"},
     {"bench"},
     {"cli"},
 ]

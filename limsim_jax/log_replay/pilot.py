@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Key
 
 from limsim_jax.geometry import wrap_angle
-from limsim_jax.log_replay.scene import Scene
+from limsim_jax.log_replay.arrays import SceneArrays
 from limsim_jax.log_replay.takeover import Ego, Flight, Moment
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, to_frenet
 from limsim_jax.policies.base import PolicyLike
@@ -53,7 +53,7 @@ class PolicyPilot:
         if self.policy.others:
             raise ValueError("policy: one that drives others beside the ego; in a log there is the ego alone")
 
-    def init(self, scene: Scene, ego: Ego) -> Flight:
+    def init(self, scene: SceneArrays, ego: Ego) -> Flight:
         """On the log."""
         config = self._config(scene)
         zero = jnp.zeros_like(scene.log.x[0, 0])
@@ -72,7 +72,7 @@ class PolicyPilot:
 
     def step(
         self,
-        scene: Scene,
+        scene: SceneArrays,
         ego: Ego,
         flight: Flight,
         moment: Moment,
@@ -123,10 +123,12 @@ class PolicyPilot:
             memory=_Memory(moved, command, policy),
         )  # fmt: skip
 
-    def _config(self, scene: Scene) -> Config:
+    def _config(self, scene: SceneArrays) -> Config:
         return Config(dt=scene.log.dt, decision_every=self.decision_every)
 
-    def _world(self, scene: Scene, ego: Ego, moment: Moment, a: Array, t: Array, own: State | None) -> State:
+    def _world(
+        self, scene: SceneArrays, ego: Ego, moment: Moment, a: Array, t: Array, own: State | None
+    ) -> State:
         """All vehicles on lanes, and the ego in the plane; with `own` the ego as it is known there."""
         me = jnp.arange(moment.x.shape[0])
         log = scene.log
@@ -159,7 +161,7 @@ class PolicyPilot:
         return replace(state, egos=replace(own.egos, slot=slot), **known)
 
 
-def scene_row(scene: Scene, t: Int[Array, ""]) -> tuple[Array, Array, Array, Array]:
+def scene_row(scene: SceneArrays, t: Int[Array, ""]) -> tuple[Array, Array, Array, Array]:
     """x, y, heading and v of the log at a moment."""
     log = scene.log
     return log.x[t], log.y[t], log.heading[t], log.v[t]

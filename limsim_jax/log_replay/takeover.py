@@ -26,7 +26,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from limsim_jax.log_replay.scene import MARGIN, Scene, Sight, pose, separation, sight, sight_of
+from limsim_jax.log_replay.arrays import MARGIN, SceneArrays, Sight, pose, separation, sight, sight_of
 from limsim_jax.traffic.car_following import ACC, IDM, NO_GAP, CarFollowing, ballistic
 from limsim_jax.xla import mapped_like
 
@@ -156,13 +156,13 @@ class Flight(NamedTuple):
 class Pilot(Protocol):
     """Drives an ego in the plane, from the first moment at which it is told something on."""
 
-    def init(self, scene: Scene, ego: Ego) -> Flight:
+    def init(self, scene: SceneArrays, ego: Ego) -> Flight:
         """Before the first moment."""
         ...
 
     def step(
         self,
-        scene: Scene,
+        scene: SceneArrays,
         ego: Ego,
         flight: Flight,
         moment: Moment,
@@ -195,7 +195,7 @@ class _Lead(NamedTuple):
 
 
 def replay(
-    scene: Scene,
+    scene: SceneArrays,
     ego: Ego,
     options: Takeover | None = None,
     *,
@@ -244,7 +244,7 @@ def replay(
 
 
 def replay_many(
-    scene: Scene,
+    scene: SceneArrays,
     egos: Ego,
     options: Takeover | None = None,
     *,
@@ -264,7 +264,7 @@ def replay_many(
 
 
 def _step(
-    scene: Scene, ego: Ego, options: Takeover, going: _Going, flight: Flight | None, t: Int[Array, ""]
+    scene: SceneArrays, ego: Ego, options: Takeover, going: _Going, flight: Flight | None, t: Int[Array, ""]
 ) -> tuple[_Going, Moment, _Events]:
     """Everybody at moment `t`, and how they go on to the next."""
     log = scene.log
@@ -371,7 +371,7 @@ def _step(
 
 
 def _fly(
-    scene: Scene, flight: Flight, flies: Array, p: Array, v: Array, a: Array, seen: Sight
+    scene: SceneArrays, flight: Flight, flies: Array, p: Array, v: Array, a: Array, seen: Sight
 ) -> tuple[Array, Array, Array, Sight]:
     """The ego where it is in the plane; its `p` is the place beside it on the path of its log."""
     found = sight_of(scene, flight.x, flight.y, flight.heading)
@@ -386,7 +386,7 @@ def _fly(
     )
 
 
-def _leader(scene: Scene, seen: Sight, minded: Array, p: Array, v: Array, a: Array) -> _Lead:
+def _leader(scene: SceneArrays, seen: Sight, minded: Array, p: Array, v: Array, a: Array) -> _Lead:
     """The body in the way ahead for which the IDM brakes hardest: the nearest one may be about to leave.
 
     `minded`: `[j, i]`, whom each one looks at.
@@ -409,7 +409,7 @@ def _leader(scene: Scene, seen: Sight, minded: Array, p: Array, v: Array, a: Arr
 
 
 def _yield(
-    scene: Scene,
+    scene: SceneArrays,
     options: Takeover,
     seen: Sight,
     active: Array,
@@ -431,7 +431,7 @@ def _yield(
     return jnp.maximum(wish, -_YIELDING)
 
 
-def _gaps(scene: Scene, seen: Sight, p: Array) -> tuple[Array, Array, Array]:
+def _gaps(scene: SceneArrays, seen: Sight, p: Array) -> tuple[Array, Array, Array]:
     """Of j before i, `[j, i]`: gap (m), whether j is ahead, whether it is in the way."""
     length, width = scene.log.length, scene.log.width
     cos, sin = jnp.abs(seen.cos), jnp.abs(seen.sin)
@@ -443,7 +443,7 @@ def _gaps(scene: Scene, seen: Sight, p: Array) -> tuple[Array, Array, Array]:
 
 
 def _enter(
-    scene: Scene,
+    scene: SceneArrays,
     seen: Sight,
     place: Array,
     p: Array,
@@ -470,7 +470,7 @@ def _enter(
 
 
 def _meets(
-    scene: Scene,
+    scene: SceneArrays,
     options: Takeover,
     flight: Flight | None,
     flies: Array,
@@ -504,7 +504,7 @@ def _meets(
 
 
 def _bodies(
-    scene: Scene, own: tuple[Array, ...], other: tuple[Array, ...]
+    scene: SceneArrays, own: tuple[Array, ...], other: tuple[Array, ...]
 ) -> tuple[Float[Array, "N N"], Float[Array, "N N"], Float[Array, "N N"]]:
     """Body j in the frame of body i, `[i, j]`: gaps of `separation`, and how far ahead, m."""
     dx, dy, turn = (b[None, :] - a[:, None] for a, b in zip(own, other, strict=True))
@@ -515,7 +515,7 @@ def _bodies(
 
 
 def _count(
-    scene: Scene,
+    scene: SceneArrays,
     options: Takeover,
     before: _Going,
     now: _Going,
@@ -558,7 +558,7 @@ def _count(
 # --- egos --------------------------------------------------------------------------------------------
 
 
-def as_logged(scene: Scene, slot: int | Int[Array, ""] = -1) -> Ego:
+def as_logged(scene: SceneArrays, slot: int | Int[Array, ""] = -1) -> Ego:
     """An ego that does what it did; -1: nobody is the ego."""
     count = scene.log.x.shape[0]
     return Ego(
@@ -569,7 +569,7 @@ def as_logged(scene: Scene, slot: int | Int[Array, ""] = -1) -> Ego:
 
 
 def braking(
-    scene: Scene,
+    scene: SceneArrays,
     slot: int | Int[Array, ""],
     start: float | Float[Array, ""],
     deceleration: float | Float[Array, ""],

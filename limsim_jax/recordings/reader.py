@@ -21,7 +21,7 @@ from limsim_jax.recordings.highd import read_highd
 from limsim_jax.recordings.ind import read_ind
 from limsim_jax.recordings.lanelets import SPEED_LIMIT
 from limsim_jax.recordings.ngsim import read_ngsim, read_pairs
-from limsim_jax.recordings.openacc import read_openacc
+from limsim_jax.recordings.openacc import read_openacc, read_platoon
 from limsim_jax.recordings.recording import Recording, RecordingError, Source
 from limsim_jax.recordings.scene_tables import read_scene_tables
 from limsim_jax.recordings.table import Table, header_of, read_bytes
@@ -119,12 +119,20 @@ def as_recording(source: Source) -> Recording:
     return source if isinstance(source, Recording) else read_recording(source)
 
 
-def read_tracks(path: str | Path, scenario: str | None = None, *, speed_limit: float = SPEED_LIMIT) -> Tracks:
+def read_tracks(
+    path: str | Path,
+    scenario: str | None = None,
+    *,
+    span: tuple[float, float] | None = None,
+    speed_limit: float = SPEED_LIMIT,
+) -> Tracks:
     """Read the tracks of a recorded scene with its lanes.
 
     Args:
-      path: a CommonRoad XML file, or the table `scenes_vehicles.csv`; also gzipped.
+      path: a CommonRoad XML file, the table `scenes_vehicles.csv`, or an OpenACC platoon; also gzipped.
       scenario: which one of the table; not needed if it has only one.
+      span: s, begin and end of the stretch of an OpenACC recording: one in which no car comes by the same
+        place twice. Other recordings are read whole.
       speed_limit: m/s, of the lanes: no recording tells it for all of them.
 
     Raises:
@@ -132,7 +140,15 @@ def read_tracks(path: str | Path, scenario: str | None = None, *, speed_limit: f
     """
     path = Path(path)
     data = read_bytes(path)
+    platoon = not _is_xml(data) and header_of(data)[0] in ("Date", "Vehicle_order")
+    if platoon != (span is not None):
+        raise RecordingError(
+            f"{path}: span: a stretch of s such as (60, 120) is expected of an OpenACC recording"
+            + ("" if platoon else ", and of no other")
+        )
     try:
+        if span is not None:
+            return read_platoon(path, span[0], span[1] - span[0], speed_limit=speed_limit)
         if _is_xml(data):
             return read_commonroad_tracks(path, data, speed_limit)
         return read_scene_tables(path, data, scenario, speed_limit)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from paths import SHARED, needs_shared
 
+from limsim_jax.log_replay.arrays import GRID, SceneArrays, build_arrays, pose, sight, sight_of
 from limsim_jax.log_replay.pilot import PolicyPilot
-from limsim_jax.log_replay.scene import GRID, Scene, build_scene, pose, sight, sight_of
 from limsim_jax.log_replay.takeover import Mode, Takeover, as_logged, braking, replay, replay_many
 from limsim_jax.maps import build_lane_map
 from limsim_jax.maps.lane_map import LaneMap, absolute, lane_rows
@@ -31,7 +31,7 @@ def strip(name: str, y: float, *, wide: float = 3.5, end: float = 1000.0, **link
 
 
 @functools.cache
-def platoon() -> tuple[Tracks, LaneMap, Scene]:
+def platoon() -> tuple[Tracks, LaneMap, SceneArrays]:
     """Five cars of different lengths behind one another; one enters later, the log of another one ends."""
     t = np.arange(STEPS) * DT
     v = 15 + 2 * np.sin(2 * np.pi * t / 25)
@@ -54,7 +54,7 @@ def platoon() -> tuple[Tracks, LaneMap, Scene]:
         network=network,
     )  # fmt: skip
     lane_map = build_lane_map(network)
-    return recorded, lane_map, build_scene(recorded, lane_map)
+    return recorded, lane_map, build_arrays(recorded, lane_map)
 
 
 @functools.cache
@@ -240,7 +240,7 @@ def test_paths_seen_from_one_another():
         network=lanelet_network(lanelets, "ring", "ring"),
     )  # fmt: skip
     lane_map = build_lane_map(recorded.network)
-    scene = build_scene(recorded, lane_map)
+    scene = build_arrays(recorded, lane_map)
     origin = np.asarray(lane_map.origin)
     # the path is the arc, and goes on along the lane
     for k, p in enumerate((5.3, 30.0)):
@@ -277,7 +277,7 @@ def test_paths_seen_from_one_another():
 @needs_shared
 def test_a_recorded_scene_with_egos_that_brake():
     recorded = read_tracks(TRAJECTORIES / "commonroad" / "USA_US101-4_1_T-1.xml.gz")
-    scene = build_scene(recorded, build_lane_map(recorded.network))
+    scene = build_arrays(recorded, build_lane_map(recorded.network))
     egos = jax.vmap(lambda slot, hard: braking(scene, slot, 1.0, hard))(
         jnp.arange(8, dtype=jnp.int32), jnp.array([0.0, 4.0, 6.0, 8.0, 6.0, 6.0, 6.0, 6.0])
     )
