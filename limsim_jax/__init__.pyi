@@ -7,6 +7,9 @@ from .api.results import Results as Results
 from .api.results import open_results as open_results
 from .api.sweep import sweep as sweep
 from .api.world import World as World
+from .calibration.report import calibrate as calibrate
+from .log_replay.scene import Scene as Scene
+from .log_replay.scene import load_scene as load_scene
 from .maps import bundled_maps as bundled_maps
 from .maps.lane_map import LaneMap as LaneMap
 from .maps.lane_map import pose as pose
