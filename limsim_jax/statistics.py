@@ -251,6 +251,55 @@ def mcnemar(a_not_b: int, b_not_a: int) -> float:
     return float(binomtest(a_not_b, n).pvalue) if n else 1.0
 
 
+def rate_difference(
+    events: Floats,
+    exposure: Floats,
+    other_events: Floats,
+    other_exposure: Floats,
+    *,
+    level: float = 0.95,
+    resamples: int = 2_000,
+    seed: int = 0,
+) -> Interval:
+    """Difference of two rates on the same seeds, other minus own, with percentiles of resampled seeds.
+
+    Args:
+      events, exposure, other_events, other_exposure: `[n]` each, one per seed, in the same order.
+      level: in (0, 1).
+      resamples: how many.
+      seed: of the resampling.
+
+    Raises:
+      ValueError: a total exposure of 0, or a level outside (0, 1).
+    """
+    check_level(level)
+    parts = np.stack([events, exposure, other_events, other_exposure]).astype(np.float64)
+    total = parts.sum(1)
+    if not (total[1] > 0 and total[3] > 0):
+        raise ValueError("a rate needs an exposure above 0")
+    n, rng = parts.shape[1], np.random.default_rng(seed)
+    sums = np.empty((4, resamples))
+    block = max(1, _BLOCK // n)
+    for first in range(0, resamples, block):
+        drawn = rng.integers(0, n, (min(block, resamples - first), n))
+        sums[:, first : first + len(drawn)] = parts[:, drawn].sum(-1)
+    there = (sums[1] > 0) & (sums[3] > 0)
+    sample = sums[2, there] / sums[3, there] - sums[0, there] / sums[1, there]
+    low, high = np.quantile(sample, [(1 - level) / 2, (1 + level) / 2])
+    return Interval(float(total[2] / total[3] - total[0] / total[1]), float(low), float(high))
+
+
+def rate_test(events: int, exposure: float, other_events: int, other_exposure: float) -> float:
+    """Two-sided p-value of equal Poisson rates: exact, given the number of all events.
+
+    Przyborowski and Wilenski (1940). Events on the same seeds that come together make it conservative.
+    """
+    from scipy.stats import binomtest
+
+    n = events + other_events
+    return float(binomtest(events, n, exposure / (exposure + other_exposure)).pvalue) if n else 1.0
+
+
 def holm(p: Sequence[float]) -> list[float]:
     """Adjusted p-values (Holm 1979), in the order of `p`."""
     order = np.argsort(p, kind="stable")

@@ -15,6 +15,8 @@ from limsim_jax.statistics import (
     median_interval,
     paired_t,
     poisson_rate,
+    rate_difference,
+    rate_test,
     wilson,
     zero_event_bound,
 )
@@ -177,6 +179,21 @@ def test_p_values():
     assert paired_t(np.array([3.0])) == (0.0, 1.0)
     # Holm's own steps: 4 p1, 3 p2, 2 p3, p4, never falling
     assert holm([0.02, 0.005, 0.9, 0.021]) == pytest.approx([0.06, 0.02, 0.9, 0.06])
+
+
+def test_rates_of_pairs():
+    """Equal exposure and rare events: the difference is that of the means, and its interval as SciPy's."""
+    rng = np.random.default_rng(6)
+    x, y = (rng.random((2, 300)) < [[0.2], [0.1]]) * 1.0
+    one = np.ones(300)
+    found = rate_difference(x, one, y, 2 * one, resamples=20_000)
+    expected = stats.bootstrap((y / 2 - x,), np.mean, method="percentile", rng=rng).confidence_interval
+    assert found.estimate == pytest.approx((y / 2 - x).mean())
+    assert [found.low, found.high] == pytest.approx([expected.low, expected.high], abs=4e-3)
+    assert rate_test(5, 1.0, 5, 1.0) == 1.0 == rate_test(0, 1.0, 0, 1.0)
+    assert rate_test(0, 1.0, 6, 1.0) == pytest.approx(2 * 0.5**6)
+    with pytest.raises(ValueError, match="exposure above 0"):
+        rate_difference(x, 0 * one, y, one)
 
 
 @pytest.mark.parametrize(

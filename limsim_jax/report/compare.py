@@ -14,7 +14,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
+from limsim_jax.report.formats import number, number_text, p_text
 from limsim_jax.report.tables import (
+    COMPARED,
+    RATES,
     Group,
     TextTable,
     better,
@@ -23,10 +26,17 @@ from limsim_jax.report.tables import (
     kind_of,
     metrics_of,
     null,
-    number_text,
     with_shares,
 )
-from limsim_jax.statistics import check_level, holm, mcnemar, mean_intervals, paired_t
+from limsim_jax.statistics import (
+    check_level,
+    holm,
+    mcnemar,
+    mean_intervals,
+    paired_t,
+    rate_difference,
+    rate_test,
+)
 
 if TYPE_CHECKING:
     from limsim_jax.sweeps.store import Results
@@ -49,12 +59,16 @@ _SCHEMA = pa.schema(
 class Comparison(NamedTuple):
     """What differs between A and B.
 
-    `table` has a row per scenario and metric, the strongest evidence first: scenario, policy_a, policy_b,
-    metric, meaning, kind ("mean", "proportion"), pairs (seeds in which both measured it), measured_a_only,
-    measured_b_only (seeds left out), mean_a and mean_b over the pairs, difference (B - A) with lower and
-    upper, for proportions a_not_b and b_not_a (seeds with 1 in one only), p, p_adjusted (over all rows), and
-    better: "A", "B", or null where neither more nor less is better or the evidence is weak (p_adjusted
-    above 1 - level).
+    `table` has a row per scenario and metric: the main metrics first (`tables.COMPARED`), then the strongest
+    evidence. Columns:
+
+    - scenario, policy_a, policy_b, metric, meaning, kind ("mean", "proportion", "rate");
+    - pairs (seeds in which both measured it), measured_a_only, measured_b_only (seeds left out);
+    - mean_a and mean_b over the pairs, difference (B - A) with lower and upper;
+    - for proportions a_not_b and b_not_a (seeds with 1 in one only);
+    - p, and p_adjusted over all rows;
+    - better: "A", "B", or null where neither more nor less is better, or where the evidence is weak
+      (p_adjusted above 1 - level).
     """
 
     table: pa.Table
@@ -95,7 +109,8 @@ def compare(
         row["p_adjusted"] = p
         sign = better(row["metric"]) * float(np.sign(row["difference"]))
         row["better"] = {1: "B", -1: "A"}.get(int(sign)) if p <= 1 - level else None
-    rows.sort(key=lambda row: (row["p"], -row.pop("strength")))
+    first_rows = {metric: place for place, metric in enumerate(COMPARED)}
+    rows.sort(key=lambda row: (first_rows.get(row["metric"], len(COMPARED)), row["p"], -row.pop("strength")))
     left_out = sorted({s for s, _ in (*parts_a, *parts_b)} - {first[0] for first, _ in pairs})
     if left_out:
         notes.append(f"not in both, left out: {', '.join(left_out)}")
@@ -104,7 +119,7 @@ def compare(
 
 
 def comparison_text(comparison: Comparison, k: int = 25) -> TextTable:
-    """The k rows with the strongest evidence, as text."""
+    """The main metrics, then the strongest evidence, as text; k rows at most."""
     rows = comparison.table.slice(0, k).to_pylist()
     scenarios = {row["scenario"] for row in comparison.table.select(["scenario"]).to_pylist()}
     several = len(scenarios) > 1
@@ -114,19 +129,19 @@ def comparison_text(comparison: Comparison, k: int = 25) -> TextTable:
         seeds = f"{row['pairs']:,}"
         if row["a_not_b"] is not None:
             seeds += f" ({row['a_not_b']:,} A only, {row['b_not_a']:,} B only)"
-        numbers = [f"{row[name]:.4g}" for name in ("mean_a", "mean_b")]
+        numbers = [number(row[name], 4) for name in ("mean_a", "mean_b")]
         difference = number_text(row["difference"], row["lower"], row["upper"])
-        tests = [_p_text(row[name]) for name in ("p", "p_adjusted")]
+        tests = [p_text(row[name]) for name in ("p", "p_adjusted")]
         scenario = [row["scenario"]] * several
         lines.append([*scenario, row["metric"], *numbers, difference, seeds, *tests, row["better"] or ""])
     rest = comparison.table.num_rows - len(rows)
-    notes = [*comparison.notes, "better: only where p, adjusted for the number of rows (Holm), is small"]
+    notes = [
+        *comparison.notes,
+        "The main metrics first, then the strongest evidence. better: only where p, adjusted for the number "
+        "of rows (Holm), is small.",
+    ]
     notes += [f"{rest:,} rows with less evidence are not shown"] if rest else []
     return TextTable(header, lines, notes)
-
-
-def _p_text(p: float) -> str:
-    return "<0.0001" if p < 1e-4 else f"{p:.4f}"
 
 
 def _pairs(
@@ -246,4 +261,30 @@ def _compared(
             lost, won = int((own > other).sum()), int((other > own).sum())
             row |= dict(a_not_b=lost, b_not_a=won, p=mcnemar(lost, won))
         rows.append(row)
+    rows += _rates(part_a.take(at_a), part_b.take(at_b), first, second, level)
     return rows, notes
+
+
+def _rates(
+    part_a: pa.Table, part_b: pa.Table, first: Group, second: Group, level: float
+) -> list[dict[str, Any]]:
+    """Crashes per distance, over the seeds in which both measured it."""
+    rows = []
+    for name, (source, meaning) in RATES.items():
+        wanted = [source, "distance"]
+        if not set(wanted) <= set(part_a.column_names) & set(part_b.column_names):
+            continue
+        values = np.stack([columns(part, wanted) for part in (part_a, part_b)])  # [2, seeds, 2]
+        both = ~np.isnan(values).any((0, 2))
+        events, distance = (values[:, both, 0] > 0) * 1.0, values[:, both, 1] / 1e6
+        if not (both.any() and (distance.sum(1) > 0).all()):
+            continue
+        (own, other), (x, y) = distance, events
+        row: dict[str, Any] = dict(scenario=first[0], policy_a=first[1], policy_b=second[1], metric=name)
+        row |= dict(meaning=meaning, kind="rate", pairs=int(both.sum()), measured_a_only=0, measured_b_only=0)
+        row |= dict(mean_a=x.sum() / own.sum(), mean_b=y.sum() / other.sum(), strength=0.0)
+        found = rate_difference(x, own, y, other, level=level)
+        row |= dict(zip(("difference", "lower", "upper"), found, strict=True))
+        row["p"] = rate_test(int(x.sum()), own.sum(), int(y.sum()), other.sum())
+        rows.append(row)
+    return rows

@@ -20,6 +20,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from limsim_jax.metrics.blame import Responsibility
+from limsim_jax.report.formats import estimate_text
 from limsim_jax.statistics import (
     check_level,
     mean_intervals,
@@ -51,10 +52,11 @@ _SHARES = {
     "left_road": ("off_road", "1 if the ego was off the drivable area"),
     "ran_red_light": ("red_lights", "1 if the ego crossed a stop line on red"),
 }
-_RATES = {
+RATES = {
     CRASH_RATE: ("contacts", "episodes with a contact, per 1,000 km that the ego drove"),
     AT_FAULT_RATE: ("at_fault_contacts", "those by the ego's fault by nuPlan's rules, per 1,000 km"),
 }
+"""Rates per distance: the metric that counts the events, and the meaning."""
 
 
 class Main(NamedTuple):
@@ -84,6 +86,12 @@ MAIN = (
     Main("traffic_collided", "vehicles that collided, per episode"),
 )
 """The short list, in order."""
+
+COMPARED = (
+    "success", "had_contact", "had_at_fault_contact", CRASH_RATE, "had_near_miss", "left_road",
+    "ran_red_light", "min_ttc", "nuplan_score", "carla_score", "limsim_corrected_total",
+)  # fmt: skip
+"""Metrics that a comparison tells first, in order."""
 
 
 def groups(results: Results) -> dict[Group, pa.Table]:
@@ -238,7 +246,7 @@ def _bound(x: Floats, kind: str, level: float) -> float | None:
 
 def _rates(part: pa.Table, level: float) -> list[dict[str, Any]]:
     rows = []
-    for name, (source, meaning) in _RATES.items():
+    for name, (source, meaning) in RATES.items():
         if not {source, "distance"} <= set(part.column_names):
             continue
         events, distance = columns(part, [source, "distance"]).T
@@ -290,8 +298,10 @@ def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = 
     ]
     if any("(of " in text for row in rows for text in row):
         notes.append("(of n): measured in n episodes only; the others are not in the number.")
-    if any("<" in text or ">" in text for row in rows for text in row):
-        notes.append(f"< or >: one-sided {100 * level:g} % bound where it happened in no episode, or in all.")
+    if any("at least" in text or "at most" in text for row in rows for text in row):
+        notes.append(
+            f"At least, at most: one-sided {100 * level:g} % bounds for what happened in all or none."
+        )
     return TextTable(header, rows, notes)
 
 
@@ -304,34 +314,10 @@ def cell(main: Main, row: Mapping[str, Any] | None) -> str:
     """What the short list says of a row of the summary; empty if it was never measured."""
     if row is None or not row["measured"] or row[main.statistic] is None:
         return ""
-    prefix = "median_" if main.statistic == "median" else ""
-    low, high = row[f"{prefix}lower"], row[f"{prefix}upper"]
-    text = number_text(row[main.statistic], low, high, main.scale)
-    if row["bound"] is not None:
-        text += f" {bound_text(row, main.scale)}"
+    text = " ".join(filter(None, estimate_text(row, main.statistic, main.scale)))
     if row["measured"] < row["seeds"]:
         text += f" (of {row['measured']:,})"
     return text
-
-
-def bound_text(row: Mapping[str, Any], scale: float = 1.0) -> str:
-    """The one-sided bound of a row that has one."""
-    if row["kind"] == "mean":
-        return f"(more in < {100 * row['bound']:.2g} % of episodes)"
-    sign = ">" if row["kind"] == "proportion" and row["estimate"] else "<"
-    return f"{sign} {scale * row['bound']:.2g}"
-
-
-def number_text(value: float, low: float | None, high: float | None, scale: float = 1.0) -> str:
-    """A number with its bounds, with as many digits as the bounds are wide."""
-    if low is None or high is None:
-        return f"{scale * value:.3g}"
-    width = scale * (high - low)
-    if not width > 0:
-        return f"{scale * value:.4g}"
-    digits = min(max(1 - math.floor(math.log10(width)), 0), 6)
-    value, low, high = (round(scale * x, digits) + 0.0 for x in (value, low, high))
-    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 _WORST_SCHEMA = pa.schema(
@@ -346,6 +332,7 @@ _WORST_SCHEMA = pa.schema(
         ("delta_v", pa.float64()),
         ("min_ttc", pa.float64()),
         ("left_road", pa.bool_()),
+        ("failed", pa.bool_()),
         ("kind", pa.string()),
         ("time", pa.float64()),
         ("other", pa.int32()),
@@ -361,13 +348,13 @@ _WORST_SCHEMA = pa.schema(
 def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
     """The k worst episodes of all scenarios and policies, the worst first.
 
-    By severity: contacts first, of them those at the ego's fault (by nuPlan's rules, or responsible alone
-    or with the other one), then by delta-v; then who left the road; then by the least TTC. With `metric`:
-    by its value, episodes without one left out.
+    In this order: contacts at the ego's fault (by nuPlan's rules, or by responsibility, alone or shared),
+    other contacts, both by delta-v; episodes off the road; episodes without success; the rest by the least
+    TTC. With `metric`: by its value, without the episodes in which it was not measured.
 
     Columns: place, scenario, policy, seed, metric (its value), contact, at_fault, delta_v (m/s), min_ttc
-    (s), left_road, and of the episode's worst moment kind, time (s), other (slot), value, responsible,
-    module, avoidable_by_ego, avoidable_by_other.
+    (s), left_road, failed (no success), and of the episode's worst moment kind, time (s), other (slot),
+    value, responsible, module, avoidable_by_ego, avoidable_by_other.
 
     Raises `ValueError` for an unknown metric, or one of which neither more nor less is worse.
     """
@@ -382,7 +369,7 @@ def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
     seeds = table["seed"].to_numpy()
     ranked = None if metric is None else columns(table, [metric])[:, 0]
     if metric is None or ranked is None:
-        order = np.lexsort((seeds, view["min_ttc"], -view["left_road"], -view["delta_v"],
+        order = np.lexsort((seeds, view["min_ttc"], -view["failed"], -view["left_road"], -view["delta_v"],
                             -view["at_fault"], -view["contact"]))  # fmt: skip
     else:
         order = np.lexsort((seeds, better(metric) * ranked))
@@ -394,11 +381,11 @@ def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
     for place, (i, row) in enumerate(zip(order, chosen, strict=True), 1):
         key = (row["scenario"], row["policy"], row["seed"])
         row |= dict(place=place, metric=None if ranked is None else float(ranked[i]))
-        row |= {name: bool(view[name][i]) for name in ("contact", "at_fault", "left_road")}
+        row |= {name: bool(view[name][i]) for name in ("contact", "at_fault", "left_road", "failed")}
         row["delta_v"] = float(view["delta_v"][i]) if row["contact"] else None
         row["min_ttc"] = float(view["min_ttc"][i]) if np.isfinite(view["min_ttc"][i]) else None
         moment = moments.get(key, {})
-        row |= {name: moment.get(name) for name in _WORST_SCHEMA.names[10:]}
+        row |= {name: moment.get(name) for name in _WORST_SCHEMA.names[11:]}
         if row["time"] is None:
             when = view["contact_time"][i] if row["contact"] else view["min_ttc_time"][i]
             row["time"] = null(float(when))
@@ -427,6 +414,7 @@ def _severity(table: pa.Table) -> dict[str, NDArray[Any]]:
         "at_fault": (contact & (involved | (read("at_fault_contacts", 0) > 0))) * 1.0,
         "delta_v": np.maximum(read("max_delta_v", 0), read("contact_delta_v", 0)) * contact,
         "left_road": (read("off_road", 0) > 0) * 1.0,
+        "failed": (read("success", 1) == 0) * 1.0,
         "min_ttc": read("min_ttc", math.inf),
         "contact_time": read("contact_time", math.nan),
         "min_ttc_time": read("min_ttc_time", math.nan),

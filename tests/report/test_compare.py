@@ -71,21 +71,32 @@ def test_only_seeds_in_both_and_measured_in_both():
     assert found.notes == ["highway: 3 seeds in both; left out 1 only in A and 1 only in B"]
 
 
-def test_strong_evidence_comes_first():
+def test_the_main_metrics_come_first_then_strong_evidence():
     rng = np.random.default_rng(5)
     luck = rng.normal(size=(3, 50))
     a = made({A: {"mean_speed": luck[0], "max_jerk": luck[1], "min_ttc": luck[2]}}, path="a")
     noise = rng.normal(size=(3, 50))
     b = {"mean_speed": luck[0] + 0.1 * noise[0], "max_jerk": luck[1] + 1 + noise[1], "min_ttc": luck[2]}
     found = compare(a, made({B: b | {"digest": range(50, 100)}}, path="b"))
-    assert found.table.column("metric").to_pylist() == ["max_jerk", "mean_speed", "min_ttc"]
+    assert found.table.column("metric").to_pylist() == ["min_ttc", "max_jerk", "mean_speed"]
     rows = rows_of(found)
     assert [rows[name]["better"] for name in ("max_jerk", "mean_speed", "min_ttc")] == ["A", None, None]
     assert rows["max_jerk"]["p_adjusted"] == pytest.approx(3 * rows["max_jerk"]["p"])
     assert (rows["min_ttc"]["p"], rows["min_ttc"]["lower"], rows["min_ttc"]["upper"]) == (1.0, 0.0, 0.0)
     text = comparison_text(found, k=1)
-    assert text.rows[0][0] == "max_jerk" and text.rows[0][-1] == "A"
+    assert text.rows[0][0] == "min_ttc" and text.rows[0][-1] == ""
     assert text.notes[-1] == "2 rows with less evidence are not shown"
+
+
+def test_crashes_per_distance_are_compared_over_all_seeds():
+    n = 40
+    a = {"contacts": (np.arange(n) < 12) * 2, "distance": np.full(n, 5e4)}
+    b = {"contacts": (np.arange(n) < 2) * 1, "distance": np.full(n, 1e5), "digest": range(n, 2 * n)}
+    row = rows_of(compare(made({A: a}, path="a"), made({B: b}, path="b")))["crashes_per_1000_km"]
+    assert (row["kind"], row["mean_a"], row["mean_b"]) == ("rate", pytest.approx(6.0), pytest.approx(0.5))
+    assert row["difference"] == pytest.approx(-5.5) and row["lower"] < -5.5 < row["upper"] < 0
+    assert row["p"] == pytest.approx(stats.binomtest(12, 14, 1 / 3).pvalue)
+    assert row["better"] == "B"
 
 
 def test_two_policies_of_one_directory():

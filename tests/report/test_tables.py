@@ -68,9 +68,9 @@ def test_what_never_happened_has_a_one_sided_bound():
     assert rows["success"]["bound"] == pytest.approx(1 - bound)
     assert rows["crashes_per_1000_km"]["bound"] == pytest.approx(-np.log(0.05) / 0.015)
     cells = {row[0]: row[1] for row in headline(results).rows}
-    assert cells["episodes with a contact, %"].endswith(" < 9.5")
-    assert cells["success, %"].endswith(" > 90")
-    assert cells["vehicles that collided, per episode"] == "0 (more in < 9.5 % of episodes)"
+    assert cells["episodes with a contact, %"] == "0 (at most 9.5)"
+    assert cells["success, %"] == "100 (at least 90)"
+    assert cells["vehicles that collided, per episode"] == "0 (above 0 in at most 9.5 %)"
 
 
 def test_crashes_per_distance_count_an_episode_once_and_have_the_exact_interval():
