@@ -26,7 +26,8 @@ def with_bounds(value: float, low: float | None, high: float | None, scale: floa
         return number(scale * value), ""
     width = scale * (high - low)
     if not width > 0:
-        return number(scale * value, 4), ""
+        text = number(scale * value, 4)
+        return (text.rstrip("0").rstrip(".") if "." in text else text), ""
     digits = min(max(1 - math.floor(math.log10(width)), 0), _FINEST)
     texts = [f"{round(scale * x, digits) + 0.0:,.{digits}f}" for x in (value, low, high)]
     return texts[0], f"[{texts[1]}, {texts[2]}]"

@@ -14,9 +14,12 @@ import pytest
 from fake_results import NAN, crashes, made
 from fake_traces import small_trace
 
-from limsim_jax.report import page, tables
-from limsim_jax.report.page import write_report
-from limsim_jax.sweeps.store import Results
+from limsim_jax.report import tables
+from limsim_jax.report.formats import number_text
+from limsim_jax.report.page import charts, content, write_report
+from limsim_jax.report.page.page import LISTED
+from limsim_jax.report.pictures import OTHER, pictures
+from limsim_jax.sweep.store import Results
 
 GROUP = ("highway", "like_traffic")
 
@@ -98,7 +101,7 @@ def test_the_page_says_what_the_tables_say(tmp_path):
     assert "A reference planning module would have avoided it" in text
     assert "Avoidable by the ego: yes; by the other vehicle: no" in text
     row = tables.lookup(tables.summary(results))[*GROUP, "had_contact"]
-    assert tables.number_text(row["estimate"], row["lower"], row["upper"], 100).partition(" ")[2] in text
+    assert number_text(row["estimate"], row["lower"], row["upper"], 100).partition(" ")[2] in text
     assert checker.loads == []
     order = re.findall(r'<article class="card" id="highway-like_traffic-(\d)">', path.read_text())
     assert order == ["6", "7", "5", "4", "3", "2"]
@@ -115,6 +118,41 @@ def test_without_contacts_the_bound_is_told(tmp_path):
     text = " ".join(read(path).text.split())
     assert "No contact in 59 episodes: with 95 % confidence it happens in less than 5 %." in text
     assert "Worst crash" not in text
+
+
+def test_success_comes_first_and_colours_the_verdict(tmp_path):
+    cases = (
+        ("good", dict(contacts=[0] * 40, success=[1] * 40), "Success: 100 % of 40 episodes."),
+        ("mixed", dict(contacts=[0] * 40, success=[0] * 4 + [1] * 36), "Success: 90 % of 40 episodes."),
+        ("bad", dict(contacts=[0] * 40, success=[0] * 40), "Success: 0 % of 40 episodes."),
+        ("mixed", dict(contacts=[1] + [0] * 39, at_fault_contacts=[0] * 40, success=[1] * 40), "Success"),
+        ("bad", dict(contacts=[1] + [0] * 39, at_fault_contacts=[1] + [0] * 39, success=[1] * 40), "Success"),
+        ("mixed", dict(contacts=[0] * 40), "No contact in 40 episodes"),
+    )
+    for mood, columns, said in cases:
+        path = write_report(made({GROUP: columns}), tmp_path / "r.html", worst=0)
+        body = path.read_text().partition('<div class="verdict ')[2]
+        assert body.startswith(f'{mood}">'), columns
+        words = " ".join(re.sub("<[^>]*>", "", body.partition("</div>")[0].partition(">")[2]).split())
+        assert words.startswith(said)
+    two = {(GROUP[0], name): {"success": [share] * 3} for name, share in (("fast", 1), ("slow", 0))}
+    text = " ".join(read(write_report(made(two), tmp_path / "r.html")).text.split())
+    assert "Success: fast 100 %, slow 0 % of 6 episodes in all." in text
+    assert "highway: fast, slow" in text  # the title
+
+
+def test_demand_that_finds_no_room_is_told(tmp_path):
+    columns = {"traffic_waiting": [70, 30], "traffic_entered": [100, 100], "success": [1, 1]}
+    text = " ".join(read(write_report(made({GROUP: columns}), tmp_path / "r.html")).text.split())
+    assert "Demand beyond capacity: highway: 100 of 300 vehicles never found room to enter." in text
+
+
+def test_scenarios_are_compared_only_where_there_are_several(tmp_path):
+    one = made({GROUP: {"min_ttc": [6.0, 7.0], "mean_speed": [3.0, 4.0]}})
+    page = read(write_report(one, tmp_path / "r.html"))
+    assert "scenarios" not in page.ids and "None: no contact" in page.text
+    assert "mean_speed mean speed" in page.text or "mean_speed " in page.text
+    assert "scenarios" in read(write_report(thousand(20), tmp_path / "r.html")).ids
 
 
 def test_little_is_enough(tmp_path):
@@ -148,7 +186,7 @@ def test_what_files_say_is_text(tmp_path):
     assert checker.text.count("No picture: ../<script>alert(1)</script>") == 2
     assert (*group, 1) in asked
     assert [x.name for x in tmp_path.iterdir()] == ["report.html"]
-    assert not page._file_name(group[0]).strip("abcdefghijklmnopqrstuvwxyz0123456789_")
+    assert not content.file_name(group[0]).strip("abcdefghijklmnopqrstuvwxyz0123456789_")
 
 
 def test_the_page_does_not_grow_with_the_seeds(tmp_path):
@@ -157,34 +195,37 @@ def test_the_page_does_not_grow_with_the_seeds(tmp_path):
     assert many.stat().st_size < 1.1 * few.stat().st_size < 300_000
 
 
+def points_of(svg: str, color: str) -> np.ndarray:
+    """Corners of the path of a color, `[K, 2]`, y upward."""
+    found = re.search(rf'<path d="([^"]*)" style="[^"]*stroke:{re.escape(color)}', svg)
+    assert found is not None
+    return np.array(re.findall(r"[ML] (\S+) (\S+)", found[1]), float) * (1, -1)
+
+
 def test_curves_are_the_distribution():
     """At every share the curve is at that order statistic."""
     x = np.sort(np.random.default_rng(1).normal(5, 1, 1000))
-    drawn = re.search(r'points="([^"]*)"', page._curves([x], ["a"]))
-    assert drawn is not None
-    points = np.array([[float(v) for v in point.split(",")] for point in drawn[1].split()])
+    points = points_of(charts.distributions([x], ["a"], "s", "TTC"), "var(--c0)")
+    share = (points[:, 1] - points[0, 1]) / (points[-1, 1] - points[0, 1])
     low, high = np.quantile(x, [0.002, 0.998])
-    share = (points[0, 1] - points[:, 1]) / (points[0, 1] - points[-1, 1])
-    _, to_x = page._axis(float(low), float(high), 44, 328)
-    for side in (-0.001, 0.001):  # a tenth of a pixel of the height
-        value = np.quantile(x, (share + side).clip(0, 1), method="inverted_cdf").clip(low, high)
-        assert (np.sign(side) * (np.array([to_x(v) for v in value]) - points[:, 0]) > -0.1).all()
-    assert (np.diff(points, axis=0) * (1, -1) >= 0).all()
+    value = low + (points[:, 0] - points[0, 0]) / np.ptp(points[:, 0]) * (high - low)
+    for side in (-0.001, 0.001):
+        expected = np.quantile(x, (share + side).clip(0, 1), method="inverted_cdf").clip(low, high)
+        assert (np.sign(side) * (expected - value) > -1e-3).all()
+    assert (np.diff(points, axis=0) >= 0).all()
 
 
-def test_ticks_are_round_and_within():
-    cases = (
-        (0, 1, ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"]),
-        (-7, 12, ["-5", "0", "5", "10"]),
-        (3.0, 3.0, ["2.8", "3.0", "3.2"]),
-        (900, 5200, None),
+def test_intervals_are_drawn_to_scale_and_names_are_text():
+    evil = "$a</title><script>&"
+    drawn = charts.intervals(
+        [charts.Point(evil, 2.0, 1.0, 4.0), charts.Point("b", 6.0, None, None)], "%, more is better", evil
     )
-    for low, high, expected in cases:
-        ticks, place = page._axis(low, high, 10, 110)
-        texts = [page._tick(t, ticks) for t in ticks]
-        assert expected is None or texts == expected
-        assert 3 <= len(ticks) <= 8
-        assert all(10 <= place(t) <= 110 for t in ticks)
+    a, b = points_of(drawn, "var(--c0)")
+    dots = [float(x) for x in re.findall(r"translate\((\S+) ", drawn)]
+    assert (dots[0] - a[0]) / (b[0] - a[0]) == pytest.approx(1 / 3, abs=1e-3)
+    assert (dots[1] - a[0]) / (b[0] - a[0]) == pytest.approx(5 / 3, abs=1e-3)
+    assert "<script" not in drawn and "id=" not in drawn and drawn.count("<title>") == 3
+    assert "%, more is better</text>" in drawn and "currentColor" in drawn and "#0" not in drawn
 
 
 # --- with pictures
@@ -219,8 +260,9 @@ def test_key_moments_are_pictured_and_replays_written(tmp_path):
     assert asked == [(*GROUP, 1), (*GROUP, 0)]
     assert said[0] == "replay 1 of 2: highway, like_traffic, seed 1"
     links = {link for link in checker.links if not link.startswith("#")}
-    assert links == {"replays/highway-like_traffic-1.html", "replays/highway-like_traffic-0.html"}
-    assert all((tmp_path / link).stat().st_size > 1000 for link in links)
+    files = {"replays/highway-like_traffic-1.html", "replays/highway-like_traffic-0.html"}
+    assert links == {f"{file}#t={t}" for file, t in zip(sorted(files), ("74.0", "0.0"), strict=True)}
+    assert all((tmp_path / file).stat().st_size > 1000 for file in files)
     assert "0.8 s before" in path.read_text() and "at 0.9 s" in path.read_text()
     images = [imread(BytesIO(base64.b64decode(x.partition(",")[2]))) for x in checker.loads]
     assert len(images) == 4 and all(x.startswith("data:image/png;base64,") for x in checker.loads)
@@ -233,19 +275,30 @@ def test_key_moments_are_pictured_and_replays_written(tmp_path):
 
     assert all(height(image, EGO) > 10 for image in images)
     # a ring of 61 pixels, and a name below it
-    assert [height(image, page._OTHER) > 60 for image in images] == [True, True, False, False]
+    assert [height(image, OTHER) > 60 for image in images] == [True, True, False, False]
+
+
+def test_replays_stop_when_the_time_is_up(tmp_path):
+    asked = []
+
+    def replayer(*key):
+        asked.append(key)
+        raise ValueError("gone")
+
+    write_report(crashes(), tmp_path / "report.html", replayer=replayer, seconds=0)
+    assert len(asked) == 1
 
 
 def test_the_view_holds_both_and_times_outside_the_trace_are_its_ends():
     pytest.importorskip("matplotlib")
 
     network, lane_map, trace = small_trace("roundabout")
-    views = page.pictures(network, lane_map, trace, ego=1, time=1e3, other=99)
+    views = pictures(network, lane_map, trace, ego=1, time=1e3, other=99)
     assert [caption for caption, _ in views] == ["1.1 s before", "at 1.2 s"]
     with pytest.raises(ValueError, match="slot 9"):
-        page.pictures(network, lane_map, trace, ego=9, time=0.5)
+        pictures(network, lane_map, trace, ego=9, time=0.5)
     gone = trace._replace(active=trace.active & (np.arange(12)[:, None] < 7))
-    views = page.pictures(network, lane_map, gone, ego=1, time=1.1)
+    views = pictures(network, lane_map, gone, ego=1, time=1.1)
     assert views[-1][0] == "at 0.7 s"  # when the ego was there last
 
 
@@ -281,5 +334,5 @@ def test_in_a_browser(tmp_path):
     seeds = [int(x) for x in told["up"].split(",")]
     assert seeds == sorted(seeds) and told["down"].split(",") == [str(x) for x in sorted(seeds, reverse=True)]
     ttc = [float(x) for x in told["ttc"].split(",")]
-    assert ttc == sorted(ttc) and len(ttc) == page.LISTED
+    assert ttc == sorted(ttc) and len(ttc) == LISTED
     assert told["width"] <= 390

@@ -124,7 +124,7 @@ def test_clicks_keys_and_moments(page, browser):
         and "responsible: both, prediction" in buttons[0]
     )
     assert (
-        "contact, delta-v 3.21 m/s (worst)" in buttons[2]
+        "contact, delta-v 3.2 m/s (worst)" in buttons[2]
         and "the other" in buttons[2]
         and f"slot {HIT}" in buttons[2]
     )

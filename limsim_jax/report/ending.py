@@ -1,0 +1,65 @@
+"""Where the episode of an ego ends: it arrives, or it leaves the road."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limsim_jax.simulation.trace import Trace
+
+AFTER = 2.0
+"""s of traffic to show after the ego has gone."""
+
+
+class Ending(NamedTuple):
+    """The last step of an ego, and how it ends."""
+
+    step: int  # the last one at which the ego is shown
+    arrived: bool
+
+
+def ending(trace: Trace, ego: int) -> Ending | None:
+    """The end of the first vehicle in a slot.
+
+    It has arrived at the first step at which it has 0 m to go; the simulation may drive it on from there.
+
+    Args:
+      trace: `[T, ...]`.
+      ego: slot.
+
+    Returns:
+      None if no vehicle is ever in the slot.
+    """
+    active, vehicle = np.asarray(trace.active)[:, ego], np.asarray(trace.vehicle)[:, ego]
+    there = np.flatnonzero(active)
+    if not there.size:
+        return None
+    first = int(there[0])
+    stays = active[first:] & (vehicle[first:] == vehicle[first])
+    last = first + (int(np.argmin(stays)) - 1 if not stays.all() else len(stays) - 1)
+    if trace.to_go is None or trace.driven is None or np.asarray(trace.driven)[first, :1].tolist() != [ego]:
+        return Ending(last, False)
+    goal = np.flatnonzero(np.asarray(trace.to_go)[first : last + 1] <= 0)
+    return Ending(first + int(goal[0]), True) if goal.size else Ending(last, False)
+
+
+def without_arrived(trace: Trace, ego: int, end: Ending | None) -> NDArray[np.bool_]:
+    """`active [T, N]` without the ego from the step after its arrival."""
+    active = np.array(trace.active, bool)
+    if end is not None and end.arrived:
+        vehicle = np.asarray(trace.vehicle)[:, ego]
+        after = np.arange(len(active)) > end.step
+        active[:, ego] &= ~(after & (vehicle == vehicle[end.step]))
+    return active
+
+
+def shown_steps(time: NDArray[Any], end: Ending | None, moments: NDArray[Any] | None = None) -> int:
+    """How many steps to show: until `AFTER` s after the end, and at least until the last moment (s)."""
+    if end is None:
+        return len(time)
+    until = float(time[end.step]) + AFTER
+    if moments is not None and moments.size:
+        until = max(until, float(np.max(moments)) + AFTER)
+    return int(np.searchsorted(time, until + 1e-6, side="right"))

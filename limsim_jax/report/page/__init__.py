@@ -1,0 +1,3 @@
+"""The page of a sweep: one HTML file."""
+
+from limsim_jax.report.page.page import write_report as write_report
