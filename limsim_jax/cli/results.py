@@ -34,8 +34,11 @@ PolicyOption = Annotated[
 ]
 
 
-IN_SWEEP = 1
-"""Worst episodes with pictures in the report at the end of a sweep: each scenario costs a compilation."""
+IN_SWEEP = 6
+"""Worst episodes with pictures in the report at the end of a sweep."""
+
+SECONDS = 60.0
+"""s after which such a report begins no further replay: each scenario costs a compilation."""
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -120,7 +123,7 @@ def sweep(
     if part is None:
         opened, table = _print_headline(folder)
         if html:
-            _write_report(opened, table, folder / "report.html", worst=IN_SWEEP)
+            _write_report(opened, table, folder / "report.html", IN_SWEEP, SECONDS)
 
 
 def report(
@@ -207,7 +210,7 @@ def replay(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Write .html (viewer), .gif or .mp4 (video), .png (the end), .parquet or .npz (every step)."
+            help="Write .html (viewer), .gif or .mp4 (video), .png (worst moment), .parquet, .npz (steps)."
             "  [default: RESULTS/replays/SCENARIO-POLICY-SEED.html]",
         ),
     ] = None,
@@ -249,11 +252,12 @@ def replay(
         case ".gif" | ".mp4":
             from limsim_jax.report.video import write_video
 
-            write_video(path, network, lane_map, trace, egos=[ego])
+            write_video(path, network, lane_map, trace, follow=ego, moments=moments)
         case ".png":
             from limsim_jax.report.video import write_picture
 
-            write_picture(path, network, lane_map, trace, egos=[ego])
+            at = moments[0]["time"] if moments else None
+            write_picture(path, network, lane_map, trace, at, follow=ego, moments=moments)
         case _:
             from limsim_jax.simulation.table import write_trace
 
@@ -357,7 +361,9 @@ def _print_table(table: TextTable) -> None:
         print(note)
 
 
-def _write_report(results: Results, table: pa.Table, path: Path, worst: int) -> None:
+def _write_report(
+    results: Results, table: pa.Table, path: Path, worst: int, seconds: float = math.inf
+) -> None:
     from limsim_jax.api.results import rebuild
     from limsim_jax.report.page import write_report
 
@@ -368,5 +374,5 @@ def _write_report(results: Results, table: pa.Table, path: Path, worst: int) -> 
     def again(scenario: str, policy: str, seed: int) -> tuple[Any, ...]:
         return episodes(scenario, policy).replay(seed)
 
-    write_report(results, path, replayer=again, worst=worst, say=print, table=table)
+    write_report(results, path, replayer=again, worst=worst, seconds=seconds, say=print, table=table)
     print(f"wrote {path}")

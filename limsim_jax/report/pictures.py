@@ -80,7 +80,7 @@ def _one(
     from matplotlib.figure import Figure
     from matplotlib.patheffects import withStroke
 
-    from limsim_jax.report.video import EGO, draw_frame
+    from limsim_jax.report.frames import EGO, draw_frame
 
     figure = Figure(figsize=(4.8, 4.8 * _HALF[1] / _HALF[0]), dpi=130, facecolor="white")
     FigureCanvasAgg(figure)

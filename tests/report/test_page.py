@@ -236,7 +236,7 @@ def test_key_moments_are_pictured_and_replays_written(tmp_path):
     pytest.importorskip("matplotlib")
     from matplotlib.image import imread
 
-    from limsim_jax.report.video import EGO
+    from limsim_jax.report.frames import EGO
 
     network, lane_map, trace = small_trace("roundabout")
     moments = [

@@ -7,17 +7,20 @@ import numpy as np
 import pytest
 
 pytest.importorskip("matplotlib")
-from fake_traces import HIT, OWN, N, T, small_trace
+from fake_traces import GONE, HIT, LATE, OWN, N, T, small_trace
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from PIL import Image
 
 from limsim_jax.maps.lane_map import absolute, lane_rows
-from limsim_jax.maps.outline import signal_bars
 from limsim_jax.maps.signals import SignalState
 from limsim_jax.report import video
-from limsim_jax.report.video import COLLIDED, EGO, SIGNALS, draw_frame, write_picture, write_video
+from limsim_jax.report.ending import ending
+from limsim_jax.report.frames import COLLIDED, EGO, SIGNALS, Scene, draw_frame, stop_bars
+from limsim_jax.report.stills import Camera, Captions, MapPage
+from limsim_jax.report.video import write_picture, write_video
+from limsim_jax.simulation.trace import Trace
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +106,7 @@ def test_bars_of_one_lane_lie_as_its_turns_do():
     """Left, straight, right from left to right; none overlaps another."""
     network, lane_map, _ = small_trace("intersection")
     rows = lane_rows(network)
-    bars, behind = signal_bars(network, lane_map)
+    bars, behind = stop_bars(network, lane_map)
     rank = {"left": 0, "slight_left": 1, "straight": 2, "slight_right": 3, "right": 4}
     turn = {rows[m.via[0]]: rank[m.turn.name.lower()] for m in network.movements if m.via}
     shared = 0
@@ -122,9 +125,10 @@ def test_bars_of_one_lane_lie_as_its_turns_do():
     assert shared
 
 
-def test_a_frame_shows_nothing_of_those_before(world):
+def test_a_frame_shows_nothing_of_earlier_frames(world):
     network, lane_map, trace = world
-    page = video._Page(network, video._Moments(network, lane_map, trace, [OWN]), 0.0, None, 100)
+    scene = Scene(network, lane_map, trace, [OWN])
+    page = MapPage(network, scene, Captions(scene, []), 0.0, None, 50)
     first, other, again = page.frames([0, T - 1, 0])
     assert (first != other).any() and (first == again).all()
 
@@ -161,22 +165,88 @@ def test_video_follows_a_slot(world, tmp_path):
             frames.append(np.asarray(image.convert("RGB"), int))
     assert len(frames) == 2
     pink = [np.abs(frame - np.array([0xD8, 0x1B, 0x8C])).max(-1) < 30 for frame in frames]
-    assert all(p.any() for p in pink)  # the ego is in view before and after
+    for p in pink:  # the ego is in the middle before and after, though the steadied camera lags its jump
+        assert p.any() and p.shape == (720, 1280)
 
 
 def test_picture(world, tmp_path):
     network, lane_map, trace = world
     write_picture(tmp_path / "end.png", network, lane_map, trace)
-    write_picture(tmp_path / "start.png", network, lane_map, trace, 0.1)
+    write_picture(tmp_path / "start.png", network, lane_map, trace, at=0.1)
     end, start = imread(tmp_path / "end.png"), imread(tmp_path / "start.png")
     assert end.shape == start.shape and 0 < (end != start).any(-1).mean() < 0.02
+
+
+def test_the_camera_stays_above_its_vehicle(world):
+    """The vehicle is where the view says, drawn to scale on a map that lies under it."""
+    network, lane_map, trace = world
+    scene = Scene(network, lane_map, trace, [OWN])
+    camera = Camera(network, scene, Captions(scene, []), OWN, 0.0, 100)
+    for k, pixels in zip((0, 6, T - 1), camera.frames([0, 6, T - 1]), strict=True):
+        assert pixels.shape == (720, 1280, 3)
+        rows, columns = np.nonzero(np.abs(pixels - np.array([0xD8, 0x1B, 0x8C], float)).max(-1) < 30)
+        middle = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2
+        offset = (scene.xy[k, OWN] - camera.places[k]) * (1, -1) * camera.scale
+        np.testing.assert_allclose(middle, np.array([640, 360]) + offset, atol=4)
+        assert np.hypot(np.ptp(columns), np.ptp(rows)) < 1.4 * np.hypot(*trace.box[k, OWN, 3:]) * camera.scale
+    whole = camera.tile.copy()
+    (low, _), (bottom, _) = camera.ax.get_xlim(), camera.ax.get_ylim()
+    assert camera.scale == pytest.approx(720 / 70)
+    first = np.round((np.array([low, bottom]) - camera.corner) * camera.scale)
+    np.testing.assert_allclose(np.array([low, bottom]), camera.corner + first / camera.scale)
+    assert whole.shape == (1440, 2560, 4)
+
+
+def test_captions_tell_key_moments_while_they_happen(world):
+    network, lane_map, trace = world
+    scene = Scene(network, lane_map, trace, [OWN])
+    moments = [
+        {"kind": "contact", "time": 0.4, "value": 3.21, "other": HIT},
+        {"kind": "off_road", "time": 9.0, "value": None, "other": np.nan},
+    ]
+    captions = Captions(scene, moments)
+    assert captions.at(0.5) == ("contact, delta-v 3.2 m/s, at 0.4 s", HIT)
+    assert captions.at(5.0) == ("", None)
+    assert captions.at(8.0) == ("off the road, at 9.0 s", None)
+
+
+def arriving(trace: Trace, step: int) -> Trace:
+    """The same with an ego that has 0 m to go from a step on."""
+    to_go = np.maximum(0.5 * (step - np.arange(T)), 0.0)
+    return trace._replace(driven=np.full((T, 1), OWN), to_go=to_go)
+
+
+def test_an_ego_ends_where_it_arrives_or_leaves(world):
+    _, _, trace = world
+    assert ending(trace, OWN) == (T - 1, False) and ending(trace, GONE) is None
+    assert ending(arriving(trace, 5), OWN) == (5, True)
+    assert ending(arriving(trace, 5), HIT) == (T - 1, False)  # the distance is that of another vehicle
+    assert ending(trace, LATE) == (5, False)  # another vehicle gets the slot
+    left = trace._replace(active=trace.active & (np.arange(T)[:, None] < 7))
+    assert ending(left, OWN) == (6, False)
+
+
+def test_an_ego_is_not_drawn_after_its_arrival(world, tmp_path):
+    network, lane_map, trace = world
+    scene = Scene(network, lane_map, arriving(trace, 5), [OWN])
+    assert scene.active[:, OWN].tolist() == [True] * 6 + [False] * 6
+    assert scene.active[:, HIT].all()
+    assert Captions(scene, []).at(0.6) == ("arrived, at 0.6 s", None)
+    long = Trace(*(None if x is None else np.repeat(x, 5, 0) for x in arriving(trace, 2)))
+    long = long._replace(time=0.1 * np.arange(1, 5 * T + 1))
+    write_video(tmp_path / "a.gif", network, lane_map, long, egos=[OWN], every=10)
+    write_video(tmp_path / "b.gif", network, lane_map, long, egos=[OWN], every=10, begin=1.0, end=5.5)
+    with Image.open(tmp_path / "a.gif") as a, Image.open(tmp_path / "b.gif") as b:
+        # arrival at 1.1 s, and 2 s more; 1.0 to 5.5 s
+        assert (frames_of(a), frames_of(b)) == (4, 5)
 
 
 REFUSALS: dict[str, Any] = {
     "suffix": (lambda w, p: write_video(p / "x.avi", *w), "x.avi"),
     "picture suffix": (lambda w, p: write_picture(p / "x.jpg", *w), ".png"),
-    "time": (lambda w, p: write_picture(p / "x.png", *w, time=99.0), "time = 99"),
+    "time": (lambda w, p: write_picture(p / "x.png", *w, at=99.0), "time = 99"),
     "slot": (lambda w, p: write_video(p / "x.gif", *w, follow=N), f"slot {N}"),
+    "span": (lambda w, p: write_video(p / "x.gif", *w, begin=1.0, end=0.5), "no step in between"),
     "fps": (lambda w, p: write_video(p / "x.gif", *w, fps=0), "frames per second"),
     "every": (lambda w, p: write_video(p / "x.gif", *w, every=0), "every 0"),
 }

@@ -30,7 +30,7 @@ from fake_replays import (
 
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES, absolute, lane_ids
 from limsim_jax.maps.signals import SignalState
-from limsim_jax.report.video import EGO, SIGNALS
+from limsim_jax.report.frames import EGO, SIGNALS
 from limsim_jax.report.viewer import DRIVEN, write_viewer
 from limsim_jax.simulation.trace import Trace
 
@@ -85,7 +85,7 @@ def test_gap_and_times_to_collision_are_shown(world, page, browser):
     assert browser.fact("soonest") == columns["soonest"][SELF, 3] < gap / 2.0  # somebody from the side
     assert browser.text("[data-field=soonest]").endswith(f"slot {columns['soonest_of'][SELF, 3]:.0f}")
     browser.open(page, f"#t={TIME[3]:.1f}&select={LEAD}")
-    assert browser.text("[data-field=gap]") == "nobody ahead" and np.isnan(browser.fact("ttc"))
+    assert browser.text("[data-field=gap]") == "none ahead" and np.isnan(browser.fact("ttc"))
 
 
 def test_between_steps_vehicles_move_evenly_but_not_from_one_vehicle_to_the_next(page, browser):

@@ -15,8 +15,8 @@ function fact(name, label, text, value) {
   dd.dataset.value = value === null || value === undefined ? "" : String(value);
 }
 function inspect() {
-  $("nobody").hidden = Boolean(sel);
-  $("somebody").hidden = $("plots").hidden = !sel;
+  $("unselected").hidden = Boolean(sel);
+  $("selected").hidden = $("plots").hidden = !sel;
   $("follow").disabled = !sel;
   if (!sel) return;
   const there = sel.first <= k && k <= sel.last, j = Math.min(Math.max(k, sel.first), sel.last), i = sel.slot * T + j;
@@ -53,7 +53,7 @@ function inspect() {
     facts.to_go.title = "along the route, with 30 m for each change of lanes";
   }
   const headway = lead >= 0 && C.v[i] > 0.5 ? `, ${(C.gap[i] / C.v[i]).toFixed(1)} s` : "";
-  fact("gap", "gap to leader", lead < 0 ? "nobody ahead" : `${number(C.gap[i], 2)} m${headway}, slot ${lead}`, lead < 0 ? null : C.gap[i]);
+  fact("gap", "gap to leader", lead < 0 ? "none ahead" : `${number(C.gap[i], 2)} m${headway}, slot ${lead}`, lead < 0 ? null : C.gap[i]);
   facts.gap.dataset.lead = lead;
   fact("ttc", "TTC, leader", C.ttc[i] < 0 ? "–" : `${C.ttc[i].toFixed(2)} s`, C.ttc[i] < 0 ? null : C.ttc[i]);
   fact("soonest", "TTC, boxes", C.soonest[i] < 0 ? "–" : `${C.soonest[i].toFixed(2)} s, slot ${of}`, C.soonest[i] < 0 ? null : C.soonest[i]);

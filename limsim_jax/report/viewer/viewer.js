@@ -110,7 +110,7 @@ function select(stay) {
 }
 function selectSlot(slot) {
   let stay = stayAt(slot, k);
-  if (!stay)  // nobody there now: who is nearest in time
+  if (!stay)  // empty now: the vehicle nearest in time
     for (const other of stays[slot]) {
       const away = o => Math.max(o.first - k, k - o.last);
       if (!stay || away(other) < away(stay)) stay = other;

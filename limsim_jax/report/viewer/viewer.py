@@ -27,8 +27,8 @@ from limsim_jax.maps.network import Network
 from limsim_jax.maps.signals import SignalState
 from limsim_jax.metrics.moments import RESPONSIBLE, value_text, words
 from limsim_jax.report.ending import ending, shown_steps, without_arrived
+from limsim_jax.report.frames import COLLIDED, DRIVEN, EGO, SIGNALS
 from limsim_jax.report.templates import read, render
-from limsim_jax.report.video import COLLIDED, EGO, SIGNALS
 from limsim_jax.report.viewer.pack import Pack, held, origin
 from limsim_jax.report.viewer.roads import add_map
 from limsim_jax.report.viewer.traffic import add_driven, add_traffic
@@ -36,9 +36,6 @@ from limsim_jax.simulation.trace import Trace
 from limsim_jax.types import Status
 
 SUFFIXES = (".html", ".htm")
-
-DRIVEN = "#ff7a00"
-"""Colour of vehicles around the ego that the policy drives, and of their plans."""
 
 MOMENT_COLORS = {
     "contact": "#d7191c", "off_road": "#8c510a", "red_light": "#c2185b", "near_miss": "#e66100",
