@@ -13,10 +13,12 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from limsim_jax.maps.draw import INK, TRAFFIC_ZORDER, Bounds, draw_network
-from limsim_jax.maps.lane_map import LaneMap, absolute, lane_rows
+from limsim_jax.maps.lane_map import LaneMap, absolute
 from limsim_jax.maps.network import Network
+from limsim_jax.maps.outline import Bounds, signal_bars
 from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.report.draw import TRAFFIC_ZORDER, draw_network
+from limsim_jax.report.draw.painter import INK
 from limsim_jax.report.ending import ending, without_arrived
 from limsim_jax.simulation.trace import Trace
 from limsim_jax.types import Status
@@ -132,7 +134,7 @@ class Scene:
         self.egos_first = np.argsort(self.ego, kind="stable")  # drawn last, so on top
         limits = [lane.speed_limit for lane in network.drivable_lanes()]
         self.top_speed = 5.0 * math.ceil(max(limits, default=10.0) / 5.0)  # m/s
-        self.bars, rows = stop_bars(network, lane_map)  # [B, 2, 2]
+        self.bars, rows = signal_bars(network, lane_map)  # [B, 2, 2]
         states = jax.vmap(lane_states, (None, 0))(lane_map.signals, trace.phase)
         self.signals = np.asarray(states)[:, rows]  # [T, B]
 
@@ -168,37 +170,6 @@ class Scene:
             since = len(same) - int(np.argmin(same[::-1])) if not same.all() else 0
             lines.append(self.xy[first + since : k + 1, slot])
         return lines
-
-
-def stop_bars(network: Network, lane_map: LaneMap) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Bars `[B, 2, 2]` at stop lines, and the row of the lane behind the light that each one shows.
-
-    Where a lane leads to several lanes with lights, they share its width from left to right.
-    """
-    rows = lane_rows(network)
-    program, stop_s = np.asarray(lane_map.signals.lane_program), np.asarray(lane_map.stop_s)
-    bars, behind = [], []
-    for name, row in rows.items():
-        lane = network.lanes[name]
-        after = [x for x in lane.successors if x in rows and program[rows[x]] >= 0]
-        if not after:
-            continue
-        s = float(stop_s[row])
-        xyz, heading = lane.pose(np.array([s]))
-        x, y, heading = xyz[0, 0], xyz[0, 1], float(np.asarray(heading).reshape(-1)[0])
-        ahead, left = (
-            np.array([math.cos(heading), math.sin(heading)]),
-            np.array([-math.sin(heading), math.cos(heading)]),
-        )
-
-        ways = [network.lanes[other].xyz[-1, :2] - (x, y) for other in after]
-        order = np.argsort([-math.atan2(way @ left, way @ ahead) for way in ways])
-        half = 0.45 * float(lane.width_at(s))
-        edges = np.linspace(half, -half, len(after) + 1)
-        for k, other in enumerate(order):
-            bars.append([(x, y) + edges[k] * left, (x, y) + edges[k + 1] * left])
-            behind.append(rows[after[other]])
-    return np.array(bars).reshape(-1, 2, 2), np.array(behind, int)
 
 
 class Layer:

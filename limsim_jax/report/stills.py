@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from limsim_jax.maps.draw import INK, Bounds, _prepare, _strips, _view
 from limsim_jax.maps.network import Network
+from limsim_jax.maps.outline import Bounds, outlines, view
 from limsim_jax.metrics.moments import value_text, words
+from limsim_jax.report.draw.layout import strips
+from limsim_jax.report.draw.painter import INK
 from limsim_jax.report.frames import Layer, Scene, draw_map_only
 from limsim_jax.report.pictures import OTHER
 
@@ -78,18 +80,18 @@ class MapPage:
         width, height = _PAGE
         left, bottom, right, top = _MARGINS
         room = (width - left - right, height - bottom - top)
-        shapes, _ = _prepare(network)
-        strips, stacked, _ = _strips(shapes, _view(network, shapes, bounds), room)
+        shapes = outlines(network)
+        windows, stacked, _ = strips(shapes, view(network, shapes, bounds), room)
         if bounds is not None:
-            strips, stacked = [bounds], True
-        if len(strips) == 1:
-            strips = [_grown(strips[0], room[0] / room[1])]
-        rows, columns = (len(strips), 1) if stacked else (1, len(strips))
+            windows, stacked = [bounds], True
+        if len(windows) == 1:
+            windows = [_grown(windows[0], room[0] / room[1])]
+        rows, columns = (len(windows), 1) if stacked else (1, len(windows))
         cell = (room[0] - (columns - 1) * _GAP) / columns, (room[1] - (rows - 1) * _GAP) / rows
         self.figure: Any = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
         self.canvas = FigureCanvasAgg(self.figure)
         self.layers: list[Layer] = []
-        for i, box in enumerate(strips):
+        for i, box in enumerate(windows):
             x = left + (0 if stacked else i) * (cell[0] + _GAP)
             y = bottom + (rows - 1 - i if stacked else 0) * (cell[1] + _GAP)
             ax = self.figure.add_axes((x / width, y / height, cell[0] / width, cell[1] / height))

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from limsim_jax.maps.draw import INK, Bounds
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.network import Network
+from limsim_jax.maps.outline import Bounds
+from limsim_jax.report.draw.painter import INK
 from limsim_jax.report.ending import shown_steps
 from limsim_jax.report.frames import COLLIDED, EGO, SIGNALS, Scene, step_at
 from limsim_jax.report.stills import DPI, Camera, Captions, MapPage

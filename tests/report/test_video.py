@@ -14,10 +14,11 @@ from matplotlib.image import imread
 from PIL import Image
 
 from limsim_jax.maps.lane_map import absolute, lane_rows
+from limsim_jax.maps.outline import signal_bars
 from limsim_jax.maps.signals import SignalState
 from limsim_jax.report import video
 from limsim_jax.report.ending import ending
-from limsim_jax.report.frames import COLLIDED, EGO, SIGNALS, Scene, draw_frame, stop_bars
+from limsim_jax.report.frames import COLLIDED, EGO, SIGNALS, Scene, draw_frame
 from limsim_jax.report.stills import Camera, Captions, MapPage
 from limsim_jax.report.video import write_picture, write_video
 from limsim_jax.simulation.trace import Trace
@@ -106,7 +107,7 @@ def test_bars_of_one_lane_lie_as_its_turns_do():
     """Left, straight, right from left to right; none overlaps another."""
     network, lane_map, _ = small_trace("intersection")
     rows = lane_rows(network)
-    bars, behind = stop_bars(network, lane_map)
+    bars, behind = signal_bars(network, lane_map)
     rank = {"left": 0, "slight_left": 1, "straight": 2, "slight_right": 3, "right": 4}
     turn = {rows[m.via[0]]: rank[m.turn.name.lower()] for m in network.movements if m.via}
     shared = 0
