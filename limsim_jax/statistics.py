@@ -49,7 +49,7 @@ def wilson(events: int, trials: int, level: float = 0.95) -> Interval:
 
     Args:
       events: how often it happened.
-      trials: out of so many.
+      trials: in how many trials.
       level: in (0, 1).
 
     Raises:
@@ -244,7 +244,12 @@ def paired_t(differences: ArrayLike) -> tuple[float, float]:
 
 
 def mcnemar(a_not_b: int, b_not_a: int) -> float:
-    """Two-sided exact p-value of McNemar's test on the pairs in which only one of the two has the event."""
+    """Two-sided exact p-value of McNemar's test.
+
+    Args:
+      a_not_b: pairs in which only A has the event.
+      b_not_a: pairs in which only B has it.
+    """
     from scipy.stats import binomtest
 
     n = a_not_b + b_not_a
@@ -261,7 +266,7 @@ def rate_difference(
     resamples: int = 2_000,
     seed: int = 0,
 ) -> Interval:
-    """Difference of two rates on the same seeds, other minus own, with percentiles of resampled seeds.
+    """Other rate minus own, on the same seeds, by percentiles of resamples.
 
     Args:
       events, exposure, other_events, other_exposure: `[n]` each, one per seed, in the same order.

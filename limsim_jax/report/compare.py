@@ -82,7 +82,7 @@ def compare(
     policies: tuple[str, str] | None = None,
     level: float = 0.95,
 ) -> Comparison:
-    """Compare B with A, seed by seed, in every scenario that both have.
+    """Compare B with A, seed by seed, in their common scenarios.
 
     Args:
       a: results.

@@ -10,7 +10,7 @@ _FINEST = 4  # decimals
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits, at most 4 decimals, and commas between thousands."""
+    """A number with significant `digits`, commas, and at most 4 decimals."""
     if value == 0 or not math.isfinite(value):
         return f"{value + 0.0:.0f}"
     size = math.floor(math.log10(abs(value)))

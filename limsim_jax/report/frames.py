@@ -58,10 +58,10 @@ def draw_frame(
     tail: float = 0.0,
     bounds: Bounds | None = None,
 ) -> dict[str, Any]:
-    """Draw the map and one moment of the traffic on axes that the caller owns, in file coordinates.
+    """Draw the map and one moment of the traffic, in file coordinates.
 
     Args:
-      ax: axes, placed and sized before.
+      ax: axes of the caller, placed and sized before.
       network: the map.
       lane_map: of that map.
       trace: `[T, ...]`.
@@ -83,7 +83,7 @@ def draw_frame(
 
 
 def draw_map_only(ax: Axes, network: Network, bounds: Bounds | None) -> None:
-    """The map without its traffic lights, whose colour would be taken for what they show."""
+    """The map without its traffic lights, whose colours would look like signals."""
     for artist in draw_network(ax, network, bounds=bounds).get("lights", ()):
         artist.remove()
 
@@ -139,7 +139,7 @@ class Scene:
         self.signals = np.asarray(states)[:, rows]  # [T, B]
 
     def outlines(self, k: int, scale: float) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Slots on the road, and their polygons `[M, 6, 2]`, enlarged by `scale`."""
+        """Slots on the road, and their polygons `[M, 6, 2]` times `scale`."""
         slots = self.egos_first[self.active[k][self.egos_first]]
         corner = _OUTLINE * self.size[k, slots, None] * scale
         cos, sin = np.cos(self.heading[k, slots])[:, None], np.sin(self.heading[k, slots])[:, None]
@@ -160,7 +160,7 @@ class Scene:
         return lines, own
 
     def tails(self, k: int, seconds: float) -> list[NDArray[Any]]:
-        """Where the vehicles of step `k` came from in the last seconds, `[K, 2]` each."""
+        """The last seconds of the vehicles of step `k`, `[K, 2]` each."""
         first = int(np.searchsorted(self.time, self.time[k] - seconds))
         lines = []
         for slot in np.flatnonzero(self.active[k]):

@@ -29,9 +29,9 @@ def pictures(
     time: float | None,
     other: int | None = None,
 ) -> list[tuple[str, bytes]]:
-    """Two views around an ego, 2 s before a moment and at it: caption and PNG of each.
+    """Two views around an ego: 2 s before a moment, and at it.
 
-    The view holds the ego at both times, and the other vehicle where it is within 60 m. Without a time:
+    Both views hold the ego at both times, and the other vehicle where it is within 60 m. Without a time:
     the end. Raises `ValueError` for an empty trace or a slot that it does not have.
     """
     from limsim_jax.maps.lane_map import absolute
@@ -40,7 +40,7 @@ def pictures(
     if not times.size:
         raise ValueError("the trace is empty")
     if not 0 <= ego < active.shape[1]:
-        raise ValueError(f"slot {ego}? the trace has slots 0 to {active.shape[1] - 1}")
+        raise ValueError(f"slot {ego}: the trace has slots 0 to {active.shape[1] - 1}")
     at = len(times) - 1 if time is None else int(np.argmin(np.abs(times - time)))
     there = np.flatnonzero(active[: at + 1, ego])
     at = int(there[-1]) if there.size else at  # the ego may have left at the moment

@@ -42,7 +42,9 @@ class Captions:
             value, other = row.get("value"), row.get("other")
             known = value is not None and math.isfinite(value)
             text = ", ".join(
-                filter(None, (words(row["kind"]), value_text(row["kind"], value) if known else ""))
+                filter(
+                    None, (words(row["kind"]), value_text(row["kind"], float(row["value"])) if known else "")
+                )
             )
             slot = None if other is None or not 0 <= other < scene.v.shape[1] else int(other)
             self.rows.append((float(row["time"]), text, slot))
@@ -52,7 +54,7 @@ class Captions:
         self.times = np.array([time for time, *_ in self.rows])
 
     def at(self, time: float) -> tuple[str, int | None]:
-        """The caption of a time (s), and the slot of the other vehicle; empty where nothing happens."""
+        """Caption and slot of the other vehicle at a time (s)."""
         before, after = _CAPTION
         near = [row for row in self.rows if before <= time - row[0] <= after]
         if not near:
@@ -62,7 +64,7 @@ class Captions:
 
 
 class MapPage:
-    """A figure that shows the whole map (in strips if it is long and thin) or one window of it."""
+    """The whole map, in strips if it is long and thin, or one window."""
 
     def __init__(
         self,
@@ -217,7 +219,7 @@ class Camera:
 
         figure = Figure(figsize=(2.4, 0.55), dpi=self.dpi, facecolor="white")
         canvas = FigureCanvasAgg(figure)
-        ax = figure.add_axes((0.07, 0.62, 0.86, 0.24))
+        ax: Any = figure.add_axes((0.07, 0.62, 0.86, 0.24))
         vehicles = self.layer.artists["vehicles"]
         colors = ScalarMappable(vehicles.norm, vehicles.cmap)
         figure.colorbar(colors, cax=ax, orientation="horizontal", label="speed, m/s")
@@ -255,8 +257,8 @@ class Camera:
             speed = f"   {scene.v[k, self.slot]:.1f} m/s" if there else ""
             self.clock.set_text(f"{scene.time[k]:6.1f} s{speed}   {scene.active[k].sum()} vehicles")
             self.caption.set_text(caption)
-            shown = other is not None and scene.active[k, other]
-            self.ring.set_data(*(scene.xy[k, [other]].T if shown else ([], [])))
+            shown = [] if other is None or not scene.active[k, other] else [other]
+            self.ring.set_data(*scene.xy[k, shown].T)
             for artist in (*self.layer.artists.values(), self.ring):
                 self.ax.draw_artist(artist)
             for text in (self.clock, self.caption) if caption else (self.clock,):

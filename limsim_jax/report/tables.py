@@ -95,7 +95,7 @@ COMPARED = (
 
 
 def groups(results: Results) -> dict[Group, pa.Table]:
-    """Episodes of each (scenario, policy), in the order of the provenance, by seed.
+    """Episodes of each (scenario, policy) by seed, in the order of the provenance.
 
     Raises `ValueError` if there are none.
     """
@@ -129,7 +129,7 @@ def metrics_of(episodes: pa.Table) -> list[str]:
 
 
 def with_shares(episodes: pa.Table, units: Mapping[str, str]) -> tuple[pa.Table, dict[str, str]]:
-    """Episodes with the shares that follow from their metrics (`had_contact`, ...), and all units."""
+    """Episodes with the shares that follow from their metrics, and all units."""
     units = dict(units)
     for name, (source, meaning) in _SHARES.items():
         if source in episodes.column_names and name not in episodes.column_names:
@@ -150,7 +150,7 @@ def kind_of(meaning: str) -> Kind:
 
 
 def better(metric: str) -> int:
-    """1 if more of a metric is better, -1 if less is, 0 if neither."""
+    """1 if more of a metric is better, -1 if less, 0 if neither."""
     if metric.startswith("min_") and not metric.endswith("_time"):
         return 1
     if metric.startswith(("nuplan_", "carla_", "limsim_")):
@@ -395,11 +395,13 @@ def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
     return pa.Table.from_pylist(rows, _WORST_SCHEMA)
 
 
-_RESPONSIBLE = {int(who): who.name.lower() for who in Responsibility if who is not Responsibility.NONE}
+_RESPONSIBLE = {
+    int(party): party.name.lower() for party in Responsibility if party is not Responsibility.NONE
+}
 
 
 def _severity(table: pa.Table) -> dict[str, NDArray[Any]]:
-    """Columns that the ranking needs, 0 (for TTC inf, for times NaN) where there is nothing."""
+    """Columns of the ranking; 0 (TTC inf, times NaN) where not measured."""
 
     def read(name: str, otherwise: float) -> Floats:
         if name not in table.column_names:

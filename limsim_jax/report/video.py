@@ -1,4 +1,4 @@
-"""Pictures and videos of traffic, from the standard record of a rollout (`simulation.trace.Trace`).
+"""Pictures and videos of traffic, from a `simulation.trace.Trace`.
 
 Videos as .mp4 need imageio-ffmpeg (extra `viz`). matplotlib is imported when something is drawn.
 """

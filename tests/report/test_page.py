@@ -95,7 +95,7 @@ def test_the_page_says_what_the_tables_say(tmp_path):
     checker = read(path)
     text = " ".join(checker.text.split())
     assert "4 of 8 episodes had a contact, 1 by the ego's fault (nuPlan's rules)." in text
-    assert "Worst crash: highway, seed 5" in text  # by delta-v, though it ranks behind who is at fault
+    assert "Worst crash: highway, seed 5" in text  # by delta-v, though it ranks behind the ego's fault
     assert "delta-v 9.0 m/s" in text
     assert "limsim-jax replay results --seed 6" in text
     assert "A reference planning module would have avoided it" in text
@@ -116,7 +116,7 @@ def test_the_hardest_crash_is_always_shown(tmp_path):
 def test_without_contacts_the_bound_is_told(tmp_path):
     path = write_report(made({GROUP: {"contacts": [0] * 59, "success": [1] * 59}}), tmp_path / "r.html")
     text = " ".join(read(path).text.split())
-    assert "No contact in 59 episodes: with 95 % confidence it happens in less than 5 %." in text
+    assert "No contact in 59 episodes: with 95 % confidence it happens in less than 5.0 %." in text
     assert "Worst crash" not in text
 
 

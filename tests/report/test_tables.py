@@ -140,7 +140,7 @@ def test_the_worst_by_a_metric():
     def seeds(metric: str) -> list[int]:
         return worst(crashes(), metric, 3).column("seed").to_pylist()
 
-    assert seeds("nuplan_score") == [6, 5, 4]  # less is worse; who has none is not there
+    assert seeds("nuplan_score") == [6, 5, 4]  # less is worse; an episode without one is left out
     assert worst(crashes(), "nuplan_score", 20).num_rows == 7
     assert seeds("max_delta_v") == [5, 4, 6]  # more is worse
     assert seeds("min_ttc") == [4, 5, 6]

@@ -68,7 +68,7 @@ def test_the_file_holds_the_numbers_of_the_trace(world, page):
     assert west + shift < network.bounds()[0] + 1 and east + shift > network.bounds()[2] - 1
 
 
-def test_a_slot_that_nobody_is_in_costs_nothing_and_may_hold_anything(world, tmp_path):
+def test_an_empty_slot_costs_nothing_and_may_hold_anything(world, tmp_path):
     network, lane_map, trace = world
     box, v = trace.box.copy(), trace.v.copy()
     box[:, NEVER], v[50:, LEAD] = np.nan, np.inf
@@ -110,7 +110,7 @@ def test_times_to_collision_are_gap_over_closing_speed_on_a_straight_lane(world,
     assert columns["ttc"][SELF, k] == pytest.approx(gap / (11.0 - 9.0), abs=0.006)
     assert columns["soonest"][SELF, k] == pytest.approx(gap / (11.0 - 9.0), abs=0.006)
     assert columns["soonest_of"][SELF, k] == TURNS
-    assert columns["ttc"][LEAD, k] == -1  # nobody ahead
+    assert columns["ttc"][LEAD, k] == -1  # none ahead
     assert columns["soonest_of"][TURNS, k] in (LEAD, SELF)
 
 
@@ -133,6 +133,24 @@ def test_a_clock_that_stands_still_ends_the_replay(world, tmp_path):
     write_viewer(tmp_path / "a.html", network, lane_map, trace._replace(time=time))
     meta, columns = payload(tmp_path / "a.html")
     assert meta["steps"] == 25 and columns["time"][0, -1] == pytest.approx(2.5)
+
+
+def test_what_follows_the_arrival_of_the_ego_is_left_out(world, tmp_path):
+    network, lane_map, trace = world
+    there = trace._replace(to_go=np.maximum(30.0 - trace.time * 10, 0.0))  # 3 s
+    write_viewer(tmp_path / "a.html", network, lane_map, there, ego=SELF)
+    meta, columns = payload(tmp_path / "a.html")
+    assert (
+        meta["arrived"] == pytest.approx(3.0, abs=0.11) and meta["steps"] == round(10 * meta["arrived"]) + 20
+    )
+    on = columns["vehicle"][SELF] > 0
+    assert on.sum() == round(10 * meta["arrived"])
+    assert [(row["label"], row["time"]) for row in meta["moments"]] == [("arrived", meta["arrived"])]
+    late = [{"kind": "unsafe", "time": 5.5}]
+    write_viewer(tmp_path / "b.html", network, lane_map, there, ego=SELF, moments=late)
+    assert payload(tmp_path / "b.html")[0]["steps"] == T  # no moment is cut off
+    write_viewer(tmp_path / "c.html", network, lane_map, there)
+    assert payload(tmp_path / "c.html")[0]["steps"] == T  # nothing ends without an ego
 
 
 def test_every_third_step(world, tmp_path):
@@ -176,7 +194,7 @@ def test_plans_are_kept_once_per_decision_in_quarters_of_a_second(world, page, t
                 np.testing.assert_allclose(columns[f"plan_{letter}"][of[row, k]], at, atol=0.006)
     np.testing.assert_allclose(columns["to_go"][0, :55], trace.to_go[:55], atol=0.006)
     assert (columns["to_go"][0, 55:] == -1).all()
-    # the distance to the goal is that of the first ego: nobody else's
+    # the distance to the goal is that of the first ego alone
     write_viewer(tmp_path / "a.html", bundled("intersection")[0], lane_map, trace, ego=LEAD)
     assert "to_go" not in payload(tmp_path / "a.html")[1]
 
@@ -217,14 +235,14 @@ def test_the_file_needs_nothing_else(page):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (dict(ego=N), f"ego {N}? the trace has slots 0 to {N - 1}"),
-        (dict(ego=-1), "ego -1?"),
+        (dict(ego=N), f"ego {N}: the trace has slots 0 to {N - 1}"),
+        (dict(ego=-1), "ego -1:"),
         (dict(every=0), "every 0 steps"),
         (dict(moments=[{"kind": "contact"}]), "moment 0 has no time"),
         (dict(moments=[MOMENTS[0], {"time": 2.0}]), "moment 1 has no kind"),
         (dict(moments=[{"kind": "contact", "time": float("nan")}]), "moment 0 has no time"),
         (dict(moments=[{"kind": "contact", "time": 60.0}]), "(contact) is at 60 s; the trace goes to 6 s"),
-        (dict(moments=[{"kind": "contact", "time": 1.0, "other": 9}]), "other vehicle 9? the trace has"),
+        (dict(moments=[{"kind": "contact", "time": 1.0, "other": 9}]), "other vehicle 9: the trace has"),
         (dict(interest=[(1.0, np.zeros((4, 3)))]), "polygon of interest 0 of shape (4, 3)"),
         (dict(interest=[(1.0, np.eye(4, 2)), (0.5, np.eye(4, 2))]), "polygon of interest 1 is at 0.5 s"),
         (dict(interest=[(1.0, np.full((4, 2), np.nan))]), "not finite"),
@@ -244,7 +262,7 @@ def test_a_trace_that_does_not_fit_is_refused(world, tmp_path):
     path = tmp_path / "a.html"
     with pytest.raises(ValueError, match="empty"):
         write_viewer(path, network, lane_map, Trace(*(x[:0] for x in trace)))
-    with pytest.raises(ValueError, match=r"v of shape \(60, 7\) instead of \(60, 6\): of another trace"):
+    with pytest.raises(ValueError, match=r"v of shape \(60, 7\) instead of \(60, 6\): .*another trace"):
         write_viewer(path, network, lane_map, trace._replace(v=np.zeros((T, N + 1), np.float32)))
     with pytest.raises(ValueError, match=r"phase of shape .*another map"):
         write_viewer(path, network, lane_map, trace._replace(phase=trace.phase[:, :-1]))

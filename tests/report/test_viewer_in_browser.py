@@ -82,7 +82,7 @@ def test_gap_and_times_to_collision_are_shown(world, page, browser):
     assert f"slot {TURNS}" in browser.text("[data-field=gap]")
     assert browser.fact("ttc") == pytest.approx(gap / 2.0, abs=0.006)
     _, columns = payload(page)
-    assert browser.fact("soonest") == columns["soonest"][SELF, 3] < gap / 2.0  # somebody from the side
+    assert browser.fact("soonest") == columns["soonest"][SELF, 3] < gap / 2.0  # a vehicle from the side
     assert browser.text("[data-field=soonest]").endswith(f"slot {columns['soonest_of'][SELF, 3]:.0f}")
     browser.open(page, f"#t={TIME[3]:.1f}&select={LEAD}")
     assert browser.text("[data-field=gap]") == "none ahead" and np.isnan(browser.fact("ttc"))
@@ -134,6 +134,60 @@ def test_clicks_keys_and_moments(page, browser):
     state = browser.click(*browser.middle("#time .mark:nth-of-type(2)"))
     assert state["time"] == "2.5000" and state["playing"] == "false"
     assert problems(browser) == []
+
+
+def test_keys_belong_to_the_map_after_a_click_on_a_button(page, browser):
+    browser.open(page, "#t=2")
+    browser.click(*browser.middle("#moments li:nth-child(3) button"))
+    assert browser.run("document.activeElement.id") == "view"
+    state = browser.key(" ")
+    assert state["playing"] == "true"  # and not the button again
+    browser.key(" ")
+    browser.run("document.getElementById('play').focus()")
+    browser.key("Enter", text="\r", windowsVirtualKeyCode=13)
+    assert browser.run("document.activeElement.id") == "play"  # chosen by keyboard: the focus stays
+
+
+def test_the_address_leads_to_the_moment_shown(page, browser):
+    browser.open(page, f"#t=2&select={HIT}")
+    browser.key("ArrowRight")
+    browser.run("new Promise(done => setTimeout(done, 500))")
+    assert browser.run("location.hash") == f"#t=2.1&select={HIT}&follow=0"
+    assert problems(browser) == []
+
+
+def test_a_replay_ends_where_the_ego_arrives(world, tmp_path, browser):
+    network, lane_map, trace = world
+    there = trace._replace(to_go=np.maximum(30.0 - trace.time * 10, 0.0))  # 3 s
+    write_viewer(tmp_path / "a.html", network, lane_map, there, ego=SELF)
+    state = browser.open(tmp_path / "a.html", "#t=99")
+    assert float(state["time"]) == pytest.approx(5.0, abs=1e-3)  # 2 s more
+    assert (
+        browser.text("#span").endswith("arrived")
+        and browser.run("document.getElementById('isego').hidden") is False
+    )
+    assert str(SELF) not in [vehicle.split(",")[0] for vehicle in state["vehicles"].split()]
+    assert "arrived" in browser.text("#moments li")
+    state = browser.open(tmp_path / "a.html", "#t=2.9")
+    assert str(SELF) in [vehicle.split(",")[0] for vehicle in state["vehicles"].split()]
+    assert problems(browser) == []
+
+
+def test_plots_have_the_time_axis_of_the_slider(page, browser):
+    browser.open(page, f"#select={LEAD}")  # which leaves at 5 s
+    _, y = browser.middle("#plot_v")
+    left, width = browser.run("(b => [b.x + 30, b.width - 36])(plot_v.getBoundingClientRect())")
+    first, last = float(TIME[0]), float(TIME[-1])
+    state = browser.click(left + 0.9 * width, y)
+    assert float(state["time"]) == pytest.approx(first + 0.9 * (last - first), abs=0.02)
+
+
+def test_buttons_fit_fingers_on_a_phone(page, browser):
+    browser.open(page, f"#t=3&select={SELF}", size=(390, 780))
+    script = """[...document.querySelectorAll("button:not(.mark), select, summary")].filter(x => x.checkVisibility())
+        .map(x => [x.id || x.className, x.getBoundingClientRect().width, x.getBoundingClientRect().height])"""
+    small = [row for row in browser.run(script) if min(row[1:]) < 44]
+    assert not small
 
 
 def test_dragging_in_plots_and_on_the_time_line_moves_the_time(page, browser):
@@ -286,7 +340,7 @@ def test_plans_are_drawn_where_they_lead_until_the_next_decision(world, page, br
         assert near(pixel(browser, *beside), EGO) == wide
 
 
-def test_whom_the_policy_drives_is_outlined(world, page, browser):
+def test_vehicles_that_the_policy_drives_are_outlined(world, page, browser):
     _, lane_map, trace = world
 
     def outline(k: int, slot: int) -> tuple[int, ...]:
@@ -383,7 +437,7 @@ def test_it_runs_in_a_frame_of_a_notebook(page, tmp_path, browser):
     assert state["ready"] == "1" and "error" not in state and state["count"] == "5"
 
 
-def test_who_gets_the_slot_of_the_ego_is_not_the_ego(world, tmp_path, browser):
+def test_the_next_vehicle_in_the_slot_of_the_ego_is_not_the_ego(world, tmp_path, browser):
     network, lane_map, trace = world
     write_viewer(tmp_path / "a.html", network, lane_map, trace, ego=AGAIN)
     for k, ego in ((SWAP - 1, True), (SWAP, False)):

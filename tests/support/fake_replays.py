@@ -28,7 +28,7 @@ EVERY, AHEAD = 5, 21  # steps per decision, moments of a plan
 
 
 def driven(lane_map: Any, route: list[int], way: Any) -> tuple[Any, Any]:
-    """Lane and s after so many metres along a route that starts at s = 0 of its first lane."""
+    """Lane and s after a way (m) along a route that starts at s = 0 of its first lane."""
     ends = np.cumsum([float(lane_map.length[lane]) for lane in route])
     i = np.minimum(np.searchsorted(ends, way, side="right"), len(route) - 1)
     return np.array(route)[i], way - np.concatenate([[0.0], ends])[i]

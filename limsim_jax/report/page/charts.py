@@ -39,7 +39,7 @@ class Point(NamedTuple):
 
 
 def intervals(points: Sequence[Point], axis: str, title: str) -> Markup:
-    """Estimates with intervals below each other, `axis` being the title of the axis."""
+    """Estimates with intervals, one below the other; `axis` is the axis title."""
     figure, ax = _axes(22 * len(points) + 42)
     for k, (name, value, low, high) in enumerate(points):
         color = _SERIES[k % 8]
@@ -81,8 +81,9 @@ def _axes(height: float) -> tuple[Figure, Axes]:
     from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
     figure = Figure(figsize=(WIDTH / 72, height / 72), dpi=72, layout="constrained")
-    figure.get_layout_engine().set(w_pad=3 / 72, h_pad=3 / 72)  # pyright: ignore[reportOptionalMemberAccess]
-    ax = figure.add_subplot()
+    engine: Any = figure.get_layout_engine()
+    engine.set(w_pad=3 / 72, h_pad=3 / 72)
+    ax: Any = figure.add_subplot()
     figure.patch.set_visible(False)
     ax.patch.set_visible(False)
     for spine in ax.spines.values():
@@ -109,14 +110,14 @@ def _svg(figure: Figure, title: str) -> Markup:
     file = io.StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "limsim-jax", "path.simplify": False}):
         figure.savefig(file, format="svg", metadata={"Date": None})
-    root = etree.fromstring(
+    root: Any = etree.fromstring(
         file.getvalue().encode(), etree.XMLParser(resolve_entities=False, remove_blank_text=True)
     )
     space = "{http://www.w3.org/2000/svg}"
     for unwanted in (*root.iter(f"{space}metadata"), *root.iter(f"{space}style")):
         unwanted.getparent().remove(unwanted)
     link = "{http://www.w3.org/1999/xlink}href"
-    shapes = {shape.get("id"): shape for defs in root.iter(f"{space}defs") for shape in defs}
+    shapes: dict[str, Any] = {shape.get("id"): shape for defs in root.iter(f"{space}defs") for shape in defs}
     for use in list(root.iter(f"{space}use")):  # markers: their shapes stand in their place
         shape = shapes[use.get(link)[1:]]
         place = f"translate({use.get('x', '0')} {use.get('y', '0')})"

@@ -1,4 +1,4 @@
-"""What a page says: the verdict, the worst episodes in words, key moments and who is responsible."""
+"""What a page says: the verdict, the worst episodes in words, key moments, responsibility."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ class Names(NamedTuple):
     @classmethod
     def of(cls, parts: Mapping[Group, Any], results: Results) -> Names:
         """Names in the order of the groups."""
-        found = (tuple({group[k]: None for group in parts}) for k in (0, 1))
-        return cls(*found, str(results.path))
+        scenarios, policies = (tuple({group[k]: None for group in parts}) for k in (0, 1))
+        return cls(scenarios, policies, str(results.path))
 
     @property
     def title(self) -> str:
@@ -86,7 +86,7 @@ def anchor(row: Mapping[str, Any]) -> str:
 
 
 def worst_crash(results: Results) -> dict[str, Any] | None:
-    """The episode with the highest delta-v, whoever is at fault, as a row of `tables.worst`."""
+    """The episode with the highest delta-v as a row of `tables.worst`."""
     if "max_delta_v" not in metrics_of(results.episodes):
         return None
     rows = worst(results, "max_delta_v", k=1).to_pylist()
@@ -105,7 +105,7 @@ def notable(row: Mapping[str, Any]) -> bool:
 def verdict(
     results: Results, parts: Mapping[Group, pa.Table], shown: set[Key], names: Names, level: float
 ) -> dict[str, Any]:
-    """Success first, then contacts, the worst crash, and demand that found no room.
+    """Success, contacts, the worst crash, demand that found no room.
 
     `mood` is "good" where nearly all episodes succeed without a contact, "bad" where the ego is at fault or
     most episodes fail, and "mixed" otherwise.
@@ -165,7 +165,7 @@ def _successes(parts: Mapping[Group, pa.Table], names: Names) -> list[tuple[str,
 
 
 def _percent(share: float) -> str:
-    """A share in per cent that is 0 or 100 only if it is."""
+    """A share in per cent; 0 and 100 are exact."""
     text = f"{100 * share:.1f}".removesuffix(".0")
     if text == "100" and share < 1:
         text = "99.9"
@@ -188,7 +188,7 @@ def _contacts(results: Results) -> pa.Table:
 
 def _party_words(results: Results) -> list[tuple[str, str, str]]:
     counts = _by_party(_contacts(results))
-    told = [(who, text, f"{counts[who]:,}") for who, text in RESPONSIBLE.items() if counts.get(who)]
+    told = [(party, text, f"{counts[party]:,}") for party, text in RESPONSIBLE.items() if counts.get(party)]
     return told + ([("", "not told", f"{counts['']:,}")] if told and counts.get("") else [])
 
 

@@ -4,7 +4,7 @@ In this order:
 
 1. what happened, and the worst crash;
 2. the main metrics with intervals;
-3. the worst seeds, each with pictures of its key moment, who is responsible, and its replay;
+3. the worst seeds, each with pictures of its key moment, the responsible party, and its replay;
 4. key moments by kind;
 5. metrics by scenario, where there are several columns;
 6. distributions, all metrics, provenance.
@@ -108,7 +108,7 @@ def write_report(
       replayer: regenerates an episode: (scenario, policy, seed) -> (network, lane_map, trace, slot of the
         ego, moments). Without one there are neither pictures nor replays, only the commands for them.
       worst: how many of the worst episodes to show with pictures.
-      seconds: no further replay begins after so many seconds; the first one always does.
+      seconds: s, after which no further replay begins; the first one always does.
       say: called with a line before each replay.
       level: of the intervals.
       table: the summary at that level, if there is one already.
@@ -175,7 +175,7 @@ def _cards(
     seconds: float,
     say: Callable[[str], None] | None,
 ) -> tuple[list[dict[str, Any]], dict[Key, str]]:
-    """Cards of the worst episodes, and the addresses of the replays that were written."""
+    """Cards of the worst episodes, and the addresses of their replays."""
     cards, replays, start = [], {}, time.monotonic()
     for place, row in enumerate(shown, 1):
         views, fault = [], ""
@@ -195,7 +195,7 @@ def _cards(
 def _replayed(
     row: Mapping[str, Any], names: Names, path: Path, replayer: Replayer
 ) -> tuple[list[dict[str, str]], str, dict[str, Any]]:
-    """Pictures of an episode's key moment, the address of its replay, and who could have avoided it."""
+    """Pictures of a key moment, the address of the replay, avoidability."""
     from limsim_jax.report.pictures import pictures
     from limsim_jax.report.viewer import write_viewer
 
@@ -321,7 +321,7 @@ def _seeds(seeds: NDArray[Any]) -> str:
 
 
 def _fact(value: Any) -> tuple[str, bool]:
-    """A fact as text, and whether its lines must stay as they are."""
+    """A fact as text, and whether its line breaks matter."""
     if isinstance(value, (dict, list, tuple)):
         return json.dumps(value, indent=1, ensure_ascii=False, default=str), True
     text = str(value)

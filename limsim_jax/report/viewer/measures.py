@@ -21,7 +21,7 @@ _PAIRS = 2**18  # pairs of vehicles measured at once
 
 
 def measure(lane_map: LaneMap, trace: Any, valid: NDArray[np.bool_]) -> tuple[NDArray[Any], ...]:
-    """Per vehicle `[T, N]`: leader, gap, 1-D TTC, least 2-D TTC and with whom (-1, `NO_GAP`, `NONE`)."""
+    """Per vehicle `[T, N]`: leader, gap, 1-D TTC, least 2-D TTC and the slot (-1, `NO_GAP`, `NONE`)."""
     steps, slots = valid.shape
     lane, start = _way_ahead(lane_map, trace, valid)
     size = max(1, min(64, _PAIRS // slots**2))  # steps at once, the same for all traces with these slots
@@ -47,7 +47,7 @@ def _times(
     gap: Float[Array, "K N"],
     v_lead: Float[Array, "K N"],
 ) -> tuple[Float[Array, "K N"], Float[Array, "K N"], Int[Array, "K N"]]:
-    """1-D TTC behind the leader; least 2-D TTC with anybody, and with whom."""
+    """1-D TTC behind the leader; least 2-D TTC, and with which slot."""
 
     def step(
         box: Float[Array, "N 5"], v: Float[Array, " N"], valid: Bool[Array, " N"]
@@ -65,7 +65,9 @@ def _times(
 def _way_ahead(
     lane_map: LaneMap, trace: Any, valid: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Lanes ahead of every vehicle `[T, N, D]`, its own first, and the metres to where each begins.
+    """Lanes ahead of every vehicle and the metres to them, `[T, N, D]`.
+
+    The first lane is its own.
 
     The way is the one that the vehicle takes later in the trace. Where that does not show it, lanes go on
     while there is only one way.
@@ -96,7 +98,7 @@ def _leaders(
     way: NDArray[np.int64],
     start: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Slot of the next vehicle ahead, -1 for none, and the gap to its rear (m), `[K, N]` each."""
+    """Leader (slot, -1: none) and the gap to its rear (m), `[K, N]`."""
     lane = way[..., 0]
     nearest = np.full(s.shape, np.inf)
     lead = np.full(s.shape, -1)
@@ -106,9 +108,9 @@ def _leaders(
         there = (lane[:, None, :] == way[..., i, None]) & (way[..., i, None] != NO_LANE)
         there &= valid[:, None, :] & ~myself & (ahead > 0)
         ahead = np.where(there, ahead, np.inf)
-        who = ahead.argmin(-1)
-        distance = np.take_along_axis(ahead, who[..., None], -1)[..., 0]
-        lead = np.where(distance < nearest, who, lead)
+        nearby = ahead.argmin(-1)
+        distance = np.take_along_axis(ahead, nearby[..., None], -1)[..., 0]
+        lead = np.where(distance < nearest, nearby, lead)
         nearest = np.minimum(distance, nearest)
     gap = nearest - np.where(lead >= 0, np.take_along_axis(length, np.maximum(lead, 0), 1), 0)
     lead = np.where(gap < LOOK_AHEAD, lead, -1)

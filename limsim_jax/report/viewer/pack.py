@@ -11,7 +11,7 @@ from limsim_jax.maps.lane_map import LaneMap
 
 
 class Pack:
-    """Columns of whole numbers, as differences along their rows with the signs in the last bit.
+    """Columns of whole numbers: differences along rows, signs in the last bit.
 
     The four bytes of the numbers lie in four planes: the upper ones are almost all 0 and vanish in
     deflate.
@@ -33,7 +33,7 @@ class Pack:
         self.size += len(self.parts[-1])
 
     def add_points(self, name: str, xy: NDArray[np.float64], shift: NDArray[np.float64]) -> None:
-        """Add points `[K, 2]` in file coordinates, to the centimetre, as `name`_x and `name`_y."""
+        """Add points `[K, 2]` (file coordinates) to the centimetre, as `name`_x, `name`_y."""
         for axis, letter in enumerate("xy"):
             self.add(f"{name}_{letter}", xy[:, axis] - shift[axis], 100)
 

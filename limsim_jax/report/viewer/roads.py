@@ -32,7 +32,7 @@ _DOUBLE = 0.12  # m, from a border to each line of a double mark
 
 
 def add_map(pack: Pack, network: Network, lane_map: LaneMap, phase: NDArray[Any]) -> dict[str, Any]:
-    """Add lane borders, lines and lights in file coordinates less the origin of the lane map."""
+    """Add borders, lines and lights, relative to the lane map's origin."""
     shapes = outlines(network)
     storeys = levels(shapes.values())
     x0, y0, x1, y1 = view(network, shapes, None)
@@ -84,7 +84,9 @@ def add_map(pack: Pack, network: Network, lane_map: LaneMap, phase: NDArray[Any]
 
 
 def _held_lines(network: Network, shapes: Mapping[str, Outline]) -> list[tuple[str, NDArray[np.float64]]]:
-    """Stop lines of the file and the ends of lanes that must stop or yield: kind, `[2, 2]`."""
+    """Stop lines and the ends of lanes that must stop or yield.
+
+    Kind and line `[2, 2]` of each."""
     lines = [("stop", shapes[line.spot.lane].bar(line.spot.s, 0.95)) for line in network.stop_lines]
     marked = {line.spot.lane for line in network.stop_lines}
     return lines + [

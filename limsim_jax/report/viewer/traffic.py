@@ -19,14 +19,14 @@ _PLAN_POINTS = 4  # of a plan per second: a chord of a bend is 0.1 m off at most
 
 
 def add_traffic(pack: Pack, lane_map: LaneMap, trace: Any) -> None:
-    """Add a trace of NumPy arrays, and what is worked out from it."""
+    """Add a trace of NumPy arrays, and what is measured of it."""
     active = trace.active
     finite = active & np.isfinite(trace.box).all(-1) & np.isfinite(trace.v) & np.isfinite(trace.s)
     x, y, heading, length, width = np.moveaxis(trace.box.astype(float), -1, 0)
     lead, gap, ttc, soonest, other = measure(lane_map, trace, finite)
 
     pack.add("time", trace.time.astype(float)[None], 10_000)
-    # 0: nobody, 1: there at the start, 2 and more: row of the schedule
+    # 0: empty, 1: there at the start, 2 and more: row of the schedule
     pack.add("vehicle", np.where(active, trace.vehicle + 2, 0).T, 1)
     columns: dict[str, tuple[NDArray[Any], int]] = {
         "x": (x, 100), "y": (y, 100), "heading": (heading, 10_000), "length": (length, 100),
@@ -41,7 +41,7 @@ def add_traffic(pack: Pack, lane_map: LaneMap, trace: Any) -> None:
 
 
 def add_driven(pack: Pack, lane_map: LaneMap, trace: Any, ego: int | None) -> Any:
-    """Add vehicle classes, whom the policy drives, what it plans and how far the ego has to go.
+    """Add classes, vehicles that the policy drives, plans, and the way to the goal.
 
     Returns the rows and points of plans, and the points per second. A plan is stored when it is made.
     """

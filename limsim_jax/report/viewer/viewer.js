@@ -46,7 +46,7 @@ for (let slot = 0; slot < N; slot++)
     if (k && C.vehicle[i - 1] === C.vehicle[i]) stays[slot].at(-1).last = k;
     else stays[slot].push({slot, id: C.vehicle[i], first: k, last: k});
   }
-// The ego is who is in its slot first: another vehicle may get the slot when it has left.
+// The ego is the first vehicle in its slot: another one may get the slot after it has left.
 const egoStay = meta.ego === null ? null : stays[meta.ego][0] || null;
 const egoThere = k => egoStay !== null && egoStay.first <= k && k <= egoStay.last;
 const stayAt = (slot, k) => stays[slot].find(stay => stay.first <= k && k <= stay.last);

@@ -87,7 +87,7 @@ def write_viewer(
       interest: the area of interest: `[T, N]`, whether a vehicle is in it; or times (s), ascending, and
         polygons `[K, 2]`, x and y (m) in the coordinates of the lane map, each shown until the next one.
       title: at the top; the name of the map by default.
-      every: keep one of so many steps.
+      every: steps of the trace per step of the replay.
 
     Raises:
       ValueError: an unknown suffix, a trace that is empty or does not fit together or to the map, a slot
@@ -98,7 +98,7 @@ def write_viewer(
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"cannot write '{path}': use .html")
     if every < 1:
-        raise ValueError(f"every {every} steps? at least 1")
+        raise ValueError(f"every {every} steps: at least 1")
     kept = _check_trace(network, lane_map, trace)
     steps, slots = trace.active.shape
     if ego is not None:
@@ -107,7 +107,8 @@ def write_viewer(
     trace = jax.device_get(trace)
     time = np.asarray(trace.time, float)[:kept]
     rows = [_moment(row, i, time, slots) for i, row in enumerate(moments)]
-    end = None if ego is None else ending(Trace(*(None if x is None else x[:kept] for x in trace)), ego)
+    fields: Any = [None if x is None else x[:kept] for x in trace]
+    end = None if ego is None else ending(Trace(*fields), ego)
     if ego is not None and end is not None:
         trace = trace._replace(active=without_arrived(trace, ego, end))
         if end.arrived:
@@ -177,7 +178,7 @@ def _check_trace(network: Network, lane_map: LaneMap, trace: Trace) -> int:
         shape = wanted.get(name, (steps, slots))
         if np.shape(x) != shape:
             reason = "another map" if name == "phase" and np.shape(x)[:1] == (steps,) else "another trace"
-            raise ValueError(f"{name} of shape {np.shape(x)} instead of {shape}: of {reason}?")
+            raise ValueError(f"{name} of shape {np.shape(x)} instead of {shape}: it is of {reason}")
     on = np.asarray(trace.lane)[np.asarray(trace.active)]
     if on.size and on.max() >= lanes:
         raise ValueError(f"a vehicle is on lane {on.max()}; the map has lanes 0 to {lanes - 1}: another map?")
@@ -200,11 +201,11 @@ def _check_trace(network: Network, lane_map: LaneMap, trace: Trace) -> int:
 
 def _check_slot(slot: int, slots: int, name: str) -> None:
     if not 0 <= slot < slots:
-        raise ValueError(f"{name} {slot}? the trace has slots 0 to {slots - 1}")
+        raise ValueError(f"{name} {slot}: the trace has slots 0 to {slots - 1}")
 
 
 def _check_interest(interest: Any, steps: int, slots: int) -> tuple[NDArray[np.int64] | None, Any]:
-    """Slots inside `[T, N]`, or else polygons."""
+    """Slots inside `[T, N]`, or polygons."""
     if interest is None or not hasattr(interest, "shape"):
         return None, interest
     if interest.shape != (steps, slots):
