@@ -119,11 +119,14 @@ class World:
         elif suffix in (".gif", ".mp4"):
             from limsim_jax.report.video import write_video
 
-            write_video(*place, **{"egos": egos} | options)
+            options = {"follow": self.ego if egos else None, "moments": self.moments} | options
+            write_video(*place, **options)
         elif suffix == ".png":
             from limsim_jax.report.video import write_picture
 
-            write_picture(*place, **{"egos": egos} | options)
+            at = self.moments[0]["time"] if self.moments else None
+            options = {"at": at, "follow": self.ego if egos else None, "moments": self.moments} | options
+            write_picture(*place, **options)
         else:
             write_trace(*place)
         return path

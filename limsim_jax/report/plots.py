@@ -1,6 +1,7 @@
 """Figures of notebooks in one call each: matplotlib axes in, axes out.
 
 Every function takes arrays or tables, and optional axes to draw on; without them it makes a figure.
+`results` may be those of the public API or those of `sweeps.store`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from limsim_jax.statistics import median_interval, paired_t, wilson
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from limsim_jax.sweep.store import Results
+    from limsim_jax.sweeps.store import Results
 
 Floats = NDArray[np.float64]
 
@@ -162,7 +163,7 @@ def paired(
       ValueError: no such metric, policy or scenario, or no seed in which both were measured.
     """
     _check_metric(results, metric)
-    parts = groups(results)
+    parts = groups(_stored(results))
     scenarios = [s for s in dict.fromkeys(s for s, _ in parts) if scenario in (None, s)]
     if len(scenarios) != 1:
         known = ", ".join(dict.fromkeys(s for s, _ in parts))
@@ -206,7 +207,7 @@ def moments(results: Results, *, ax: Axes | None = None) -> Axes:
     table = results.moments
     found = set(table["kind"].to_pylist())
     kinds = [kind for kind in ORDER if kind in found] + sorted(found - set(ORDER))
-    parts = groups(results)
+    parts = groups(_stored(results))
     several = len({scenario for scenario, _ in parts}) > 1
     high = 0.8 / len(parts)
     for k, (scenario, policy) in enumerate(parts):
@@ -307,25 +308,32 @@ def _axes(ax: Axes | None) -> Axes:
     return plt.subplots(layout="constrained")[1]
 
 
+def _stored(results: Any) -> Results:
+    """The results in a directory, also of the `Results` of the public API."""
+    return getattr(results, "stored", results)
+
+
 def _parts(results: Results) -> dict[str, pa.Table]:
     """Episodes with their shares, by a name as short as it can be."""
-    parts = groups(results)
+    stored = _stored(results)
+    parts = groups(stored)
     several = len({scenario for scenario, _ in parts}) > 1
     return {
-        f"{scenario} / {policy}" if several else policy: with_shares(part, results.units)[0]
+        f"{scenario} / {policy}" if several else policy: with_shares(part, stored.units)[0]
         for (scenario, policy), part in parts.items()
     }
 
 
 def _check_metric(results: Results, metric: str) -> None:
-    known = metrics_of(with_shares(results.episodes, results.units)[0])
+    stored = _stored(results)
+    known = metrics_of(with_shares(stored.episodes, stored.units)[0])
     if metric not in known:
-        raise ValueError(f"no metric '{metric}' in {results.path}; there are {', '.join(known)}")
+        raise ValueError(f"no metric '{metric}' in {stored.path}; there are {', '.join(known)}")
 
 
 def _label(results: Results, metric: str) -> str:
     """A metric and its unit, where its meaning begins with one."""
-    meaning = results.units.get(metric, "")
+    meaning = _stored(results).units.get(metric, "")
     first = meaning.replace(",", ";").partition(";")[0].strip()
     name = metric.replace("_", " ")
     return f"{name}, {first}" if kind_of(meaning) == "mean" and 0 < len(first) <= 8 else name

@@ -19,7 +19,7 @@ from limsim_jax.report.formats import number_text
 from limsim_jax.report.page import charts, content, write_report
 from limsim_jax.report.page.page import LISTED
 from limsim_jax.report.pictures import OTHER, pictures
-from limsim_jax.sweep.store import Results
+from limsim_jax.sweeps.store import Results
 
 GROUP = ("highway", "like_traffic")
 

@@ -101,7 +101,8 @@ def test_moments_stand_at_their_times_in_the_row_of_their_kind():
 
 def test_fundamental_diagrams_show_flow_or_speed():
     points = {"simulated": ([10.0, 50.0], [900.0, 2000.0])}
-    flow, speed = (plots.fundamental_diagram(points, speed=wanted).lines[0] for wanted in (False, True))
+    both: Any = (plots.fundamental_diagram(points, speed=wanted).lines[0] for wanted in (False, True))
+    flow, speed = both
     assert list(flow.get_xydata()[:, 1]) == [900.0, 2000.0]
     assert list(speed.get_xydata()[:, 1]) == [90.0, 40.0]
     with pytest.raises(ValueError, match="1 densities but 2 flows"):

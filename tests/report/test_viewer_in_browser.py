@@ -184,7 +184,8 @@ def test_plots_have_the_time_axis_of_the_slider(page, browser):
 
 def test_buttons_fit_fingers_on_a_phone(page, browser):
     browser.open(page, f"#t=3&select={SELF}", size=(390, 780))
-    script = """[...document.querySelectorAll("button:not(.mark), select, summary")].filter(x => x.checkVisibility())
+    script = """[...document.querySelectorAll("button:not(.mark), select, summary")]
+        .filter(x => x.checkVisibility())
         .map(x => [x.id || x.className, x.getBoundingClientRect().width, x.getBoundingClientRect().height])"""
     small = [row for row in browser.run(script) if min(row[1:]) < 44]
     assert not small

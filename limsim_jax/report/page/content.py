@@ -18,7 +18,7 @@ from limsim_jax.report.tables import Group, columns, metrics_of, worst
 from limsim_jax.statistics import zero_event_bound
 
 if TYPE_CHECKING:
-    from limsim_jax.sweep.store import Results
+    from limsim_jax.sweeps.store import Results
 
 Key = tuple[str, str, int]
 """Scenario, policy and seed."""

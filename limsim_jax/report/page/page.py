@@ -47,7 +47,7 @@ from limsim_jax.report.tables import MAIN, Group, better, columns, groups, looku
 from limsim_jax.report.templates import read, render
 
 if TYPE_CHECKING:
-    from limsim_jax.sweep.store import Results
+    from limsim_jax.sweeps.store import Results
 
 Replayer = Callable[[str, str, int], tuple[Any, ...]]
 """(scenario, policy, seed) -> (network, lane_map, trace, slot of the ego, moments, ...)."""
