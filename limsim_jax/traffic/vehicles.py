@@ -64,8 +64,8 @@ def sample(
     """One vehicle and its driver, every leaf of shape `[]`.
 
     Args:
-      population: whom to draw from.
-      key: of this vehicle, and of nothing else; is consumed.
+      population: from which the vehicle is drawn.
+      key: of this vehicle alone; is consumed.
       vehicle_type: row of the population; drawn by `share` if not given.
     """
     # One call of the generator: each costs compilation time.
@@ -114,7 +114,7 @@ def sample_vehicles(
     """Vehicles by number, every leaf of shape `[N]`; equal numbers give equal vehicles.
 
     Args:
-      population: whom to draw from.
+      population: from which the vehicle is drawn.
       key: of the world; vehicle i uses `fold_in(key, i)`.
       vehicle: numbers, in any order.
       vehicle_type: rows of the population; drawn by `share` if not given.

@@ -111,19 +111,19 @@ class Stream:
 def streams_of(tables: Tables, flow: Flow, number: int, horizon: float) -> list[Stream]:
     """A flow on all its departure lanes."""
     names = [flow.origin] if isinstance(flow.origin, str) else list(flow.origin)
-    who = f"flow {number} from {_some(names)}"
-    _check_numbers(who, flow)
+    label = f"flow {number} from {_some(names)}"
+    _check_numbers(label, flow)
     if not names:
         raise ValueError(f"flow {number}: it has no origin")
     end = horizon if flow.end is None else min(flow.end, horizon)
-    lanes = [_departure_lanes(tables, who, origin) for origin in names]
-    types = _type_weights(tables, who, flow.classes)
+    lanes = [_departure_lanes(tables, label, origin) for origin in names]
+    types = _type_weights(tables, label, flow.classes)
     found = []
     for origin, rows in zip(names, lanes, strict=True):
         weight = (tables.allowed[rows] * types).sum(1)  # [R]
         if not weight.any():
-            raise ValueError(f"{who}: no lane of '{origin}' is open to its vehicle classes")
-        share = _goal_shares(tables, who, flow, rows, weight)  # [G]
+            raise ValueError(f"{label}: no lane of '{origin}' is open to its vehicle classes")
+        share = _goal_shares(tables, label, flow, rows, weight)  # [G]
         to_lane = np.zeros((len(rows), len(share)))
         for g in np.nonzero(share)[0]:
             to_lane[:, g] = share[g] * _spread(tables, rows, int(g), weight)
@@ -145,32 +145,32 @@ def streams_of(tables: Tables, flow: Flow, number: int, horizon: float) -> list[
             )
             if stream.idle < 0:
                 raise ValueError(
-                    f"{who}: {stream.rate * 3600:.0f} veh/h on lane '{lane_ids(tables.network)[row]}' do not "
-                    f"fit a headway of {flow.headway:g} s, at most {3600 / flow.headway:.0f} veh/h do"
+                    f"{label}: {stream.rate * 3600:.0f} veh/h on lane '{lane_ids(tables.network)[row]}' do "
+                    f"not fit a headway of {flow.headway:g} s, at most {3600 / flow.headway:.0f} veh/h do"
                 )
             found.append(stream)
     return found
 
 
-def _check_numbers(who: str, flow: Flow) -> None:
+def _check_numbers(label: str, flow: Flow) -> None:
     if flow.pattern not in _PATTERNS:
-        raise ValueError(f"{who}: pattern '{flow.pattern}' is unknown; known are {', '.join(_PATTERNS)}")
+        raise ValueError(f"{label}: pattern '{flow.pattern}' is unknown; known are {', '.join(_PATTERNS)}")
     if not 0 <= flow.rate < math.inf:
-        raise ValueError(f"{who}: rate = {flow.rate:g} veh/h; it has to be 0 or more, and finite")
+        raise ValueError(f"{label}: rate = {flow.rate:g} veh/h; it has to be 0 or more, and finite")
     if not 0 <= flow.begin < math.inf:
-        raise ValueError(f"{who}: begin = {flow.begin:g} s; it has to be 0 or more, and finite")
+        raise ValueError(f"{label}: begin = {flow.begin:g} s; it has to be 0 or more, and finite")
     if flow.end is not None and not flow.begin <= flow.end:
-        raise ValueError(f"{who}: it ends at {flow.end:g} s, before it begins at {flow.begin:g} s")
+        raise ValueError(f"{label}: it ends at {flow.end:g} s, before it begins at {flow.begin:g} s")
     if flow.speed is not None and not 0 <= flow.speed < math.inf:
-        raise ValueError(f"{who}: speed = {flow.speed:g} m/s; it has to be 0 or more, and finite")
+        raise ValueError(f"{label}: speed = {flow.speed:g} m/s; it has to be 0 or more, and finite")
     if flow.pattern == "platoon" and not (flow.platoon >= 1 and 0 < flow.headway < math.inf):
         raise ValueError(
-            f"{who}: platoons of {flow.platoon} with a headway of {flow.headway:g} s; it takes 1 or more "
+            f"{label}: platoons of {flow.platoon} with a headway of {flow.headway:g} s; it takes 1 or more "
             "vehicles and a positive headway"
         )
 
 
-def _departure_lanes(tables: Tables, who: str, origin: str) -> list[int]:
+def _departure_lanes(tables: Tables, label: str, origin: str) -> list[int]:
     """Rows of the lanes of an origin."""
     network, ways = tables.network, road_starts(tables.network)
     ways_in = origins(network)
@@ -180,22 +180,22 @@ def _departure_lanes(tables: Tables, who: str, origin: str) -> list[int]:
         lane = network.lanes[origin]
         if not lane.drivable or lane.junction is not None:
             what = "lies inside a junction" if lane.drivable else "is not for motor traffic"
-            raise ValueError(f"{who}: lane '{origin}' {what}")
+            raise ValueError(f"{label}: lane '{origin}' {what}")
         return [tables.rows[origin]]
     both = [name for name in (f"{origin}+", f"{origin}-") if name in ways]
     inwards = [name for name in both if name in ways_in]
     if len(inwards) == 1:
         return [tables.rows[lane] for lane in ways_in[inwards[0]]]
     if both:
-        raise ValueError(f"{who}: road '{origin}' has traffic both ways; name one: {_some(both)}")
+        raise ValueError(f"{label}: road '{origin}' has traffic both ways; name one: {_some(both)}")
     lanes = [lane for lane in ways.get(origin, []) if lane.junction is None]
     if not lanes:
         known = ", ".join(list(ways_in or ways)[:5])
-        raise ValueError(f"{who}: no road or lane '{origin}' to depart from; there are {known}")
+        raise ValueError(f"{label}: no road or lane '{origin}' to depart from; there are {known}")
     return [tables.rows[lane.id] for lane in lanes]
 
 
-def _type_weights(tables: Tables, who: str, classes: Mapping[str, float] | None) -> NDArray[np.float64]:
+def _type_weights(tables: Tables, label: str, classes: Mapping[str, float] | None) -> NDArray[np.float64]:
     """Shares of the types of the population, with these weights of classes."""
     if classes is None:
         return tables.shares
@@ -203,44 +203,44 @@ def _type_weights(tables: Tables, who: str, classes: Mapping[str, float] | None)
     for name, weight in classes.items():
         if name not in VEHICLE_CLASSES:
             known = ", ".join(VEHICLE_CLASSES)
-            raise ValueError(f"{who}: vehicle class '{name}' is unknown; known are {known}")
+            raise ValueError(f"{label}: vehicle class '{name}' is unknown; known are {known}")
         if not 0 <= weight < math.inf:
-            raise ValueError(f"{who}: vehicle class '{name}' has the weight {weight:g}")
+            raise ValueError(f"{label}: vehicle class '{name}' has the weight {weight:g}")
         mine = tables.classes == VEHICLE_CLASSES.index(name)
         if weight > 0 and not mine.any():
-            raise ValueError(f"{who}: the population has no vehicles of class '{name}'")
+            raise ValueError(f"{label}: the population has no vehicles of class '{name}'")
         of_class = np.where(mine, tables.shares, 0)
         # a class that the population has but never draws: its types in equal shares
         of_class = of_class if of_class.any() else mine.astype(float)
         weights += weight * of_class / max(of_class.sum(), 1e-30)
     if not weights.any():
-        raise ValueError(f"{who}: no vehicle class has a positive weight")
+        raise ValueError(f"{label}: no vehicle class has a positive weight")
     return weights / weights.sum()
 
 
 def _goal_shares(
-    tables: Tables, who: str, flow: Flow, rows: list[int], weight: NDArray[np.float64]
+    tables: Tables, label: str, flow: Flow, rows: list[int], weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Shares of the goals of a flow, adding up to 1."""
     reachable = np.any(tables.reachable[rows] & (weight > 0)[:, None], axis=0)
     if flow.goal is None:
         if not reachable.any():
-            raise ValueError(f"{who}: it can reach none of the goals {_some(tables.goals)}")
+            raise ValueError(f"{label}: it can reach none of the goals {_some(tables.goals)}")
         return reachable / reachable.sum()
     shares = {flow.goal: 1.0} if isinstance(flow.goal, str) else dict(flow.goal)
     wanted = np.zeros(tables.reachable.shape[1])
     for name, share in shares.items():
         if name not in tables.goals:
-            raise ValueError(f"{who}: no goal '{name}'; there are {_some(tables.goals)}")
+            raise ValueError(f"{label}: no goal '{name}'; there are {_some(tables.goals)}")
         if not 0 <= share < math.inf:
-            raise ValueError(f"{who}: goal '{name}' has the share {share:g}; it has to be 0 or more")
+            raise ValueError(f"{label}: goal '{name}' has the share {share:g}; it has to be 0 or more")
         goal = tables.goals.index(name)
         if share > 0 and not reachable[goal]:
             can = _some([tables.goals[g] for g in np.nonzero(reachable)[0]]) or "none"
-            raise ValueError(f"{who}: no way to goal '{name}'; it can reach {can}")
+            raise ValueError(f"{label}: no way to goal '{name}'; it can reach {can}")
         wanted[goal] = share
     if not wanted.any():
-        raise ValueError(f"{who}: no goal has a positive share")
+        raise ValueError(f"{label}: no goal has a positive share")
     return wanted / wanted.sum()
 
 
