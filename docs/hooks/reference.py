@@ -20,19 +20,23 @@ from typing import Any
 
 NAMES = {
     "Maps": ["load_map", "bundled_maps", "Map", "pose", "to_frenet", "Network", "LaneMap", "MapError"],
-    "Experiments": ["Experiment", "Flow", "Ego", "bundled_experiments", "World", "ExperimentError"],
-    "Sweeps": ["sweep", "Results", "open_results", "Metric"],
+    "Experiments": [
+        *("Experiment", "Flow", "Ego", "bundled_experiments", "load_experiments", "World", "Futures"),
+        "ExperimentError",
+    ],
+    "Sweeps": ["sweep", "Results", "Row", "open_results", "Metric", "ResultsError"],
     "Policies": [
-        "LikeTraffic", "ConstantSpeed", "FollowLane", "PDMClosed", "PDMHybrid", "LimSimTM", "AreaOfInterest",
-        "named",
+        *("LikeTraffic", "ConstantSpeed", "FollowLane", "PDMClosed", "PDMHybrid", "LimSimTM"),
+        *("AreaOfInterest", "named"),
     ],
     "Policies of one's own": [
-        "Policy", "HostPolicy", "Observation", "Command", "Control", "Trajectory", "reference_path",
+        *("Policy", "HostPolicy", "Observation", "Command", "Control", "Trajectory"),
+        *("reference_path", "to_cartesian"),
     ],
     "Step by step": ["Env"],
     "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "Population", "default_population"],
     "Log replay": ["load_scene", "Scene"],
-}  # fmt: skip
+}
 """Public names in the order of the page; all others follow as parts of the engine."""
 
 UNITS = re.compile(
@@ -47,7 +51,7 @@ WORDS = {
     "description": "a sentence for reports",
     "traffic": "all vehicles but the egos",
     "ego": "the vehicle under test",
-    "flow": "vehicles that come in, one table per flow",
+    "flow": "a table for each stream of vehicles that come in",
     "goal": "where they go: a way out of the map, or shares of several; absent: shares by the map",
     "pattern": "random arrivals, equal gaps, or groups",
     "speed": "m/s; speed at which they come in, as fast as road and leader allow unless told",
@@ -66,6 +70,9 @@ WORDS = {
     "metrics": "metrics of your own, by module and class",
 }
 """Descriptions of fields that have none in the code."""
+
+FIELD_UNITS = {"rate": "veh/h", "density": "veh/km"}
+"""Units that descriptions do not begin with."""
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -107,6 +114,8 @@ def api() -> str:
             text += ["", f"## {title}"]
             for name in names:
                 text += ["", f"::: {_home(lj, name)}"]
+                if name in ("Flow", "Ego"):
+                    text += ["", f"The fields of `{name}` are those of the [experiment file](experiment.md)."]
     return "\n".join(text) + "\n"
 
 
@@ -154,7 +163,7 @@ def experiment() -> str:
             if not words or words in ("s", "m/s"):
                 words = WORDS.get(name, words)
             unit, words = split_unit(words)
-            words = _sentence(words)
+            unit, words = unit or FIELD_UNITS.get(name, ""), _sentence(words)
             rows.append([f"`{name}`", kind_in_words(kind), default, bounds, unit, words])
             for inner, many in _tables_in(kind):
                 brackets = ("[[", "]]") if many else ("[", "]")

@@ -16,7 +16,7 @@ PAGES = [page for page in doc_blocks.pages() if page.mode != "none"]
 
 
 def _marked(page):
-    marks = [pytest.mark.engine]
+    marks = [] if page.mode == "quick" else [pytest.mark.engine]
     return pytest.param(page, marks=marks, id=page.name)
 
 

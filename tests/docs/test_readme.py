@@ -94,6 +94,16 @@ def test_every_page_is_in_the_navigation():
         assert path.relative_to(REPO / "docs").as_posix() in text
 
 
+def test_places_that_the_contributing_page_names_exist():
+    text = (REPO / "CONTRIBUTING.md").read_text()
+    table = text[text.index("## Where is what") : text.index("Paths are below")]
+    rows = re.findall(r"^\| (?!X )(.*?) \| (.*?) \|$", table, re.M)
+    assert len(rows) >= 20
+    for _, places in rows:
+        for place in re.findall(r"`(.*?)`", places):
+            assert (REPO / place).exists() or (REPO / "limsim_jax" / place).exists(), place
+
+
 def test_the_english_is_plain():
     command = [sys.executable, ".ci/prose.py", *(str(path.relative_to(REPO)) for path in TOP), "docs"]
     found = subprocess.run(command, cwd=REPO, capture_output=True, text=True)
