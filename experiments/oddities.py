@@ -20,11 +20,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from soundness import HORIZON, INITIAL, OTHER_RATE, RATES, RESULTS, SLOTS, check_maps
 
-from limsim_jax.bench import build_traffic
 from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, bundled_maps, read_network
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.simulation.rollout import Rollout, one_world
+from limsim_jax.sweeps.build import plain_demand
 from limsim_jax.traffic.demand import sample_scenario
 from limsim_jax.traffic.engine import Tick, Traffic
 from limsim_jax.traffic.motion import boxes
@@ -89,7 +89,7 @@ def watch(name: str, worlds: int) -> dict[str, Any]:
     network = read_network(bundled_maps().get(name) or name)
     lane_map = build_lane_map(network)
     lanes = list(lane_rows(network))
-    demand, _ = build_traffic(
+    demand, _ = plain_demand(
         network, lane_map, rate=RATES.get(name, OTHER_RATE), vehicles=INITIAL, seconds=HORIZON
     )
     slots = SLOTS.get(name, 64)

@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from limsim_jax.bench import build_traffic
 from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, bundled_maps, read_network
 from limsim_jax.maps.conflicts import ConflictTable, ConflictType
@@ -28,6 +27,7 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.maps.signals import SignalState, lane_states
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.worlds import Worlds
+from limsim_jax.sweeps.build import plain_demand
 from limsim_jax.traffic.demand import sample_scenario
 from limsim_jax.traffic.engine import Tick, Traffic
 from limsim_jax.traffic.motion import tails
@@ -159,7 +159,7 @@ def episodes(
     """Run `count` episodes on a map and add up what happened."""
     network = read_network(path)
     lane_map = build_lane_map(network)
-    demand, _ = build_traffic(network, lane_map, rate=rate, vehicles=initial, seconds=HORIZON)
+    demand, _ = plain_demand(network, lane_map, rate=rate, vehicles=initial, seconds=HORIZON)
     run = Rollout(Config(dt=0.1), Traffic(), HORIZON, measure=Watch(lane_map.conflicts))
     start = time.perf_counter()
     worlds = Worlds(run, lane_map, lambda key: sample_scenario(demand, lane_map, key, slots), chunk=chunk)

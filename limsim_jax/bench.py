@@ -188,38 +188,6 @@ def policy_lines(result: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def build_traffic(
-    network: Network, lane_map: LaneMap, *, rate: float, vehicles: int, seconds: float
-) -> tuple[Demand, int]:
-    """Plain traffic: the default population that fits the map, from all origins to all goals.
-
-    On a map without origins, traffic enters at the start of a dozen of its roads.
-
-    Args:
-        network: the map.
-        lane_map: of that map, with the default goals.
-        rate: veh/h per origin.
-        vehicles: on the road at the start.
-        seconds: for how long others come.
-
-    Returns:
-        The demand, and the number of origins.
-
-    Raises:
-        ValueError: numbers that make no sense, or more vehicles than the roads hold.
-    """
-    from limsim_jax.maps.origins import origins, road_origins
-    from limsim_jax.maps.routing import default_goals
-    from limsim_jax.traffic.demand import Flow, build_demand
-    from limsim_jax.traffic.vehicles import default_population, restrict_to_map
-
-    names = list(origins(network)) or road_origins(network, 12)
-    flows = [Flow(origin=name, rate=rate) for name in names]
-    goals, population = default_goals(network), restrict_to_map(default_population(), lane_map)
-    demand = build_demand(network, lane_map, goals, flows, population, horizon=seconds, vehicles=vehicles)
-    return demand, len(names)
-
-
 def markdown(result: dict[str, Any]) -> str:
     """The result of `bench_maps` as Markdown tables."""
     facts, machine, cold, cached = (result[name] for name in ("map", "machine", "cold", "cached"))
@@ -547,10 +515,12 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
 
 def _full(network: Network, lane_map: LaneMap, rate: float, slots: int, seconds: float) -> Demand:
     """Traffic that starts with as many vehicles as there are slots, or as find room."""
+    from limsim_jax.sweeps.build import plain_demand
+
     vehicles = slots
     while True:
         try:
-            return build_traffic(network, lane_map, rate=rate, vehicles=vehicles, seconds=seconds)[0]
+            return plain_demand(network, lane_map, rate=rate, vehicles=vehicles, seconds=seconds)[0]
         except ValueError as error:
             if "places" not in str(error):
                 raise MapError(str(error)) from error

@@ -21,10 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from limsim_jax.maps import bundled_maps
-from limsim_jax.maps.lane_map import lane_rows
+from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.map import Map, load_map
 from limsim_jax.maps.network import MapError, Network
 from limsim_jax.maps.origins import origins, road_origins
+from limsim_jax.maps.routing import default_goals
 from limsim_jax.policies import POLICIES
 from limsim_jax.policies.base import PolicyLike, build_policy
 from limsim_jax.sweeps.experiment import EgoTable, ExperimentError, ExperimentFile
@@ -241,6 +242,35 @@ def demand_of(
         )  # fmt: skip
     except ValueError as error:
         raise ExperimentError(f"{experiment.name}: traffic: {error}") from None
+
+
+def plain_demand(
+    network: Network, lane_map: LaneMap, *, rate: float, vehicles: int, seconds: float
+) -> tuple[Demand, int]:
+    """Plain traffic: the default drivers that fit the map, from all origins to all goals.
+
+    On a map without origins traffic comes in at the starts of a dozen of its roads.
+
+    Args:
+      network: the map.
+      lane_map: of that map, with the default goals.
+      rate: veh/h per origin.
+      vehicles: on the road at the start.
+      seconds: for how long others come.
+
+    Returns:
+      The demand, and the number of origins.
+
+    Raises:
+      ValueError: numbers out of range, or more vehicles than the roads hold.
+    """
+    names = list(origins(network)) or road_origins(network, ROADS_OF_A_CLOSED_MAP)
+    flows = [Flow(origin=name, rate=rate) for name in names]
+    population = restrict_to_map(default_population(), lane_map)
+    demand = build_demand(
+        network, lane_map, default_goals(network), flows, population, horizon=seconds, vehicles=vehicles
+    )
+    return demand, len(names)
 
 
 def traffic_of(experiment: ExperimentFile, model: Any = None) -> Traffic:

@@ -35,6 +35,7 @@ from limsim_jax.sweeps.build import (
     demand_of,
     describe,
     egos_of,
+    flows_of,
     map_of,
     policy_of,
     traffic_of,
@@ -44,7 +45,7 @@ from limsim_jax.sweeps.moments import key_moments
 from limsim_jax.sweeps.reruns import Replay, Reruns
 from limsim_jax.sweeps.store import Outcome
 from limsim_jax.traffic.car_following import CarFollowing
-from limsim_jax.traffic.demand import sample_scenario
+from limsim_jax.traffic.demand import Flow, sample_scenario
 from limsim_jax.traffic.ego import with_rows
 from limsim_jax.traffic.vehicles import Population
 from limsim_jax.types import Config, Scenario, State
@@ -112,6 +113,16 @@ class Episodes:
     def egos(self) -> int:
         """Vehicles under test."""
         return 0 if self._egos is None else self._egos.count
+
+    @property
+    def flows(self) -> list[Flow]:
+        """The flows that come in, one per origin."""
+        return flows_of(self.experiment, self.town)
+
+    @property
+    def initial(self) -> int:
+        """Vehicles on the road at the start, egos with a start of their own not counted."""
+        return self._demand.initial
 
     @property
     def network(self) -> Network:

@@ -10,6 +10,7 @@ import pytest
 from limsim_jax import bench, cli
 from limsim_jax.maps import build_lane_map, bundled_map, read_network
 from limsim_jax.simulation import table as trace_file
+from limsim_jax.sweeps.build import plain_demand
 from limsim_jax.types import Status
 
 SECONDS, SLOTS, START = 3.0, 24, 9
@@ -107,7 +108,7 @@ def test_missing_pyarrow_is_told(monkeypatch, tmp_path, capsys):
 @pytest.mark.parametrize("vehicles", [0, 7, 30])
 def test_traffic_starts_with_the_vehicles_asked_for(vehicles):
     network = read_network(bundled_map("roundabout"))
-    demand, origins = bench.build_traffic(
+    demand, origins = plain_demand(
         network, build_lane_map(network), rate=100.0, vehicles=vehicles, seconds=5.0
     )
     assert (demand.initial, origins) == (vehicles, 4)

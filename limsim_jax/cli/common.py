@@ -1,0 +1,61 @@
+"""What several commands share: arguments, tables, windows, JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from limsim_jax.maps.network import Network
+
+MapArgument = Annotated[
+    str, typer.Argument(metavar="FILE", help="Map file, gzipped or not, or the name of a bundled map.")
+]
+JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON.")]
+NoCacheOption = Annotated[bool, typer.Option("--no-cache", help="Read the map file itself; leave no trace.")]
+
+
+def table(lines: list[tuple[str, str]], title: str | None = None) -> None:
+    """Print names and values in two columns."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for name, value in lines:
+        table.add_row(Text(name), Text(value))
+    console = Console()
+    if title is not None:
+        console.print(Text(title, style="bold"))
+    console.print(table)
+
+
+def path(file: str) -> Path:
+    """The file, or the bundled map of this name."""
+    from limsim_jax.maps import bundled_map
+
+    return path if (path := Path(file)).exists() or len(path.parts) > 1 else bundled_map(file)
+
+
+def load(file: str, no_cache: bool) -> Network:
+    """Read a map."""
+    from limsim_jax.maps import read_network
+
+    return read_network(path(file), cache=not no_cache)
+
+
+def window(text: str) -> tuple[float, float, float, float]:
+    """X0,Y0,X1,Y1 as four numbers."""
+    try:
+        x0, y0, x1, y1 = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"'{text}' is not four numbers X0,Y0,X1,Y1", param_hint="--bounds") from None
+    return x0, y0, x1, y1
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write plain values."""
+    path.write_text(json.dumps(value, indent=1) + "\n")
