@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from limsim_jax.cli.common import JsonOption, table, window, write_json
+from limsim_jax.cli.common import JsonOption, path, table, window, write_json
 from limsim_jax.files import check_writable
 
 if TYPE_CHECKING:
+    from limsim_jax.api.experiment import Experiment
     from limsim_jax.simulation.totals import Totals
 
 RATE = 400.0
