@@ -15,7 +15,7 @@ from limsim_jax.geometry import box_separation
 from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.network import ImportReport
 from limsim_jax.maps.rasterise import build_lane_map
-from limsim_jax.metrics.observer import _zones
+from limsim_jax.metrics.record import conflict_zones
 from limsim_jax.traffic.engine import Command, Traffic, _until_changed, drive
 from limsim_jax.traffic.lane_change import place_beside
 from limsim_jax.traffic.motion import boxes, tails
@@ -191,10 +191,10 @@ def blocked_crossing():
 
 def test_tail_two_lanes_back_occupies_a_conflict_zone():
     lane_map, rows, state = blocked_crossing()
-    zones = _zones(lane_map, state, jnp.int32(1), jnp.int32(rows["up"]))
+    zones = conflict_zones(lane_map, state, jnp.int32(1), jnp.int32(rows["up"]))
     assert int((zones.id >= 0).sum()) == 1 and bool(zones.other.any()) and not bool(zones.ego.any())
     gone = dataclasses.replace(state, s=state.s.at[0].set(4.5))
-    assert not bool(_zones(lane_map, gone, jnp.int32(1), jnp.int32(rows["up"])).other.any())
+    assert not bool(conflict_zones(lane_map, gone, jnp.int32(1), jnp.int32(rows["up"])).other.any())
 
 
 def test_tail_of_a_vehicle_behind_a_short_road_is_an_obstacle():

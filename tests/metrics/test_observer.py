@@ -18,8 +18,10 @@ from traffic_worlds import bundled, drivers, shapes
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, elevation, pose, width
 from limsim_jax.maps.signals import SignalState, lane_states
-from limsim_jax.metrics.observer import EvaluateEgo, StepRecord, _meets_ego
+from limsim_jax.metrics.observer import EvaluateEgo, StepRecord
+from limsim_jax.metrics.record import meets_ego
 from limsim_jax.metrics.safety import NO_GAP
+from limsim_jax.metrics.step import EgoStep
 from limsim_jax.metrics.traffic import TrafficMetrics, TrafficStep
 from limsim_jax.traffic.collision import off_road
 from limsim_jax.traffic.engine import Command, Tick
@@ -503,7 +505,7 @@ def test_who_is_off_the_road_is_looked_for_where_the_engine_did_not():
 def test_whose_way_may_meet_that_of_the_ego():
     rng = np.random.default_rng(4)
     table = host().conflicts
-    meets = jax.jit(_meets_ego)
+    meets = jax.jit(meets_ego)
     shares = []
     for _ in range(60):
         slot = int(rng.integers(N))
@@ -533,7 +535,8 @@ class Recorder:
         return self.judge and self.judge.init(*sizes)
 
     def update(self, carry, *shown):
-        self.shown.append(jax.tree.map(np.asarray, shown[-1]))
+        steps = [x for x in shown if isinstance(x, EgoStep | TrafficStep)]
+        self.shown.append(jax.tree.map(np.asarray, steps[0]))
         return self.judge and self.judge.update(carry, *shown)
 
     def result(self, carry, *area) -> Any:
@@ -658,14 +661,14 @@ def test_progress_arrival_and_signs_over_time():
             before = state
             index = {0: 0, half: 1, len(records): 2}.get(t)
             if index is not None:
-                found = carries[index]
+                found = carries[index].ego
                 assert found.goal == goal and found.lane == was and bool(found.stopped) == stopped
                 assert found.to_go == pytest.approx(to_go, rel=1e-5, abs=1e-4)
         for number, begin in ((1, 1), (2, half + 1)):
             first = records[begin - 1]
             end = half if number == 1 else len(records)
             other = np.max([record.other for record in records[begin - 1 : end]], 0)
-            expected = _meets_ego(
+            expected = meets_ego(
                 crossing(), jnp.int32(slot), jnp.asarray(first.way), jnp.asarray(other, jnp.int32)
             )
             for t in range(begin, end + 1):
