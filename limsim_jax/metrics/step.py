@@ -69,14 +69,14 @@ class StepView:
       dt: s, length of a step.
       drove: False for the record of the start, before anything has been driven.
       touched: vehicles that have touched the ego before this step.
-      lane_map: the map, where it is known.
+      known_map: the map, where it is known.
     """
 
     record: EgoStep
     dt: float
     drove: Bool[Array, ""]
     touched: Bool[Array, " N"]
-    lane_map: LaneMap | None = None
+    known_map: LaneMap | None = None
 
     # --- the ego
 
@@ -229,6 +229,13 @@ class StepView:
         if self.record.state is None:
             raise ValueError("this record keeps no state; EvaluateEgo keeps it for its own `metrics`")
         return self.record.state
+
+    @property
+    def lane_map(self) -> LaneMap:
+        """The map."""
+        if self.known_map is None:
+            raise ValueError("this step knows no map; EvaluateEgo hands it to its own `metrics`")
+        return self.known_map
 
     @property
     def lane(self) -> Int[Array, ""]:

@@ -41,7 +41,7 @@ def story(seed: int, rows: int = 2) -> list[Any]:
             state=dataclasses.replace(
                 tick.state,
                 goal=first.goal,
-                egos=jax.tree.map(lambda x: x[:rows], dataclasses.replace(tick.state.egos, slot=first.egos.slot)),
+                egos=jax.tree.map(lambda x: x[:rows], first.egos),
             )
         )
         for tick in ticks
@@ -57,8 +57,10 @@ def measure(evaluator: Any, ticks: list[Any]) -> dict[str, Any]:
         carry = evaluator.init(CONFIG, lane_map, start)
         records = jax.vmap(lambda tick: evaluator.record(CONFIG, lane_map, tick))(ticks)
         decisions = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), records)
-        update = lambda carry,
-        records: (evaluator.update(CONFIG, lane_map, carry, records), None)  # noqa: E731
+
+        def update(carry, records):
+            return evaluator.update(CONFIG, lane_map, carry, records), None
+
         return evaluator.result(CONFIG, lane_map, jax.lax.scan(update, carry, decisions)[0])
 
     return on_host(jax.device_get(all_of(ticks[0].state, stacked(ticks[1:]))))
@@ -110,7 +112,8 @@ def test_one_of_several_is_one_ego():
 
 def test_traffic_alone_has_the_traffic_metrics_of_a_world_with_an_ego():
     ticks = story(6)
-    expected = {name: value for name, value in measure(EvaluateEgo(), ticks).items() if name.startswith("traffic_")}
+    found = measure(EvaluateEgo(), ticks)
+    expected = {name: value for name, value in found.items() if name.startswith("traffic_")}
     assert set(expected) == {column.name for column in TRAFFIC}
     assert_same(measure(EvaluateTraffic(), story(6, rows=0)), expected)
 
