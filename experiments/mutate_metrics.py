@@ -95,7 +95,7 @@ SAME: dict[tuple[str, str, str], str] = {
     ("blame", "contact_update", "0 → 1"): "flags are larger, and without a hazard notes are not used",
     ("scores", "limsim_update", "1 → 2"): "seconds that are not full do not count",
     ("scores", "limsim_corrected", "0 → 1"): "the filters need two seconds anyway",
-    ("traffic", "TrafficMetrics.init", "-1 → 1"): "nobody has passed anything before the start",
+    ("traffic", "TrafficMetrics.init", "-1 → 1"): "no vehicle has passed a detector before the start",
     (
         "traffic",
         "TrafficMetrics._detect",
@@ -228,7 +228,7 @@ class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
 
 
 def _run(mutant: Mutant, tests: list[str]) -> None:
-    """Run tests with a mutant in this process, which ends with pytest's exit status."""
+    """Run tests with a mutant; this process ends with pytest's exit status."""
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
@@ -256,7 +256,7 @@ def survives(mutant: Mutant) -> bool:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Killed of tried, by module and kind, and whoever is left."""
+    """Killed of tried, by module and kind, and the mutants that survive."""
     lines = ["| metrics/ | places | " + " | ".join(KINDS) + " | survive, judged alike |"]
     lines.append("|---" + "|--:" * (len(KINDS) + 2) + "|")
     for module in [*TESTS, "all"]:
@@ -280,7 +280,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def why(row: dict[str, Any]) -> str | None:
-    """Why a survivor behaves as the original does; None if it does not, or nobody has looked."""
+    """Why a survivor behaves as the original does; None if it does not, or has not been judged."""
     if row["kind"] == "threshold":
         return "at equality, which measured quantities hardly ever meet; not judged one by one"
     return SAME.get((row["module"], row["function"], row["change"]))
@@ -290,7 +290,7 @@ def main() -> None:
     """Mutate, test, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--modules", nargs="+", choices=list(TESTS), default=list(TESTS), metavar="NAME")
-    parser.add_argument("--every", type=int, default=1, help="only every so manieth mutant")
+    parser.add_argument("--every", type=int, default=1, help="only every n-th mutant")
     parser.add_argument("--again", action="store_true", help="try those that survived, keep other results")
     parser.add_argument("--rest", action="store_true", help="try those not tried yet, keep other results")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)

@@ -1,4 +1,4 @@
-"""Contacts: what kind, who is at fault, and whether braking would have helped.
+"""Contacts: type, fault, responsibility, and whether braking would have avoided them.
 
 **Type and fault** follow nuPlan (`nuplan-devkit`, `no_ego_at_fault_collisions.py`). The first rule that
 holds decides; a body counts once.
@@ -11,23 +11,23 @@ STOPPED_OTHER      other's speed <= 0.05 m/s                                    
 REAR               centre of the other > 150 degrees off the ego's heading,     no
                    seen from the ego's rear axle
 FRONT              the ego's front edge touches the other                       yes
-LATERAL            else                                                         if in several lanes or off
+LATERAL            otherwise                                                    if in several lanes or off
                                                                                 the drivable area
 =================  ===========================================================  ==========================
 
-**Responsibility** (`Responsibility`) goes further, symmetrically for both. A vehicle is a *hazard* from
+**Responsibility** (`Responsibility`) goes further, and treats both sides alike. A vehicle is a *hazard* from
 the first step of the latest unbroken time in which the 2-D TTC with it was at most `HAZARD` s. At that
-step three things are noted for both sides: whether full braking (`b_max`, at once, along its heading)
-would have avoided the contact if the other one had kept its velocity (`avoidable_by_braking`), and
-whether it was in several lanes. A side is responsible if
+step two facts are noted for each side. The first is whether full braking (`b_max`, at once, along its
+heading) would have avoided the contact with another vehicle of constant velocity
+(`avoidable_by_braking`). The second is whether it was in several lanes. A side is responsible if
 
 1. it broke a rule that gives the other priority (red light, wrong way, right of way), or
 2. it is at fault by its type, and braking would have avoided the contact or it was changing lanes itself;
-   but not who keeps to its lane and meets the front or the side of one that is changing lanes, or
-3. it was changing lanes and that left the other one no way to avoid the contact by braking.
+   a vehicle that keeps its lane and meets the front or the side of one that changes lanes is excused, or
+3. it was changing lanes and the other side could not avoid the contact by braking.
 
-Both: SHARED. None: UNAVOIDABLE, there was no braking that would have avoided it from the first moment at
-which the other was a hazard, and nobody had broken a rule or made the hazard by a change of lanes.
+Both sides: SHARED. Neither: UNAVOIDABLE. No braking would have avoided the contact from the first moment of
+the hazard on, and neither side had broken a rule or caused the hazard by a lane change.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ from limsim_jax.metrics.safety import (
 )
 
 STOPPED = 0.05
-"""m/s: nuPlan's bound on the speed of what stands."""
+"""m/s: a vehicle that is not faster stands, by nuPlan."""
 
 HAZARD = 3.0
 """s: a vehicle with a TTC of at most this is a hazard."""
 
 
 class ContactType(enum.IntEnum):
-    """How the ego met the other one, from the ego's side."""
+    """How the ego met the other vehicle, from the ego's side."""
 
     NONE = 0
     STOPPED_EGO = 1
@@ -70,7 +70,7 @@ class ContactType(enum.IntEnum):
 
 
 class Responsibility(enum.IntEnum):
-    """Who is to blame for a contact."""
+    """Side that is to blame for a contact."""
 
     NONE = 0
     EGO = 1
@@ -80,16 +80,17 @@ class Responsibility(enum.IntEnum):
 
 
 def ahead(e: Encounter, rear_axle: Float[Array, "*#b"]) -> Bool[Array, "*b"]:
-    """Whether the other's centre is within 30 degrees of the ego's heading, seen from its rear axle.
+    """Whether the other vehicle is ahead: within 30 degrees of the ego's heading.
 
-    `rear_axle`: from the centre of the ego back to the axle, m.
+    Its centre counts, seen from the rear axle of the ego. `rear_axle`: m from the centre of the ego back to
+    its axle.
     """
     x = e.x + rear_axle
     return (x > 0) & (x * x > 3 * e.y * e.y)  # tan(30 degrees)^2 = 1/3
 
 
 def behind(e: Encounter, rear_axle: Float[Array, "*#b"]) -> Bool[Array, "*b"]:
-    """Whether it is more than 150 degrees off the ego's heading."""
+    """Whether the other vehicle is behind: more than 150 degrees off the ego's heading."""
     x = e.x + rear_axle
     return (x < 0) & (x * x > 3 * e.y * e.y)
 
@@ -118,21 +119,21 @@ def at_fault(kind: Int[Array, "*b"], several_lanes: Bool[Array, "*#b"]) -> Bool[
 def avoidable_by_braking(
     e: Encounter, v: Float[Array, "*#b"], b_max: Float[Array, "*#b"]
 ) -> Bool[Array, "*b"]:
-    """Whether the ego at speed `v` avoids the other by braking with `b_max` along its heading from now on.
+    """Whether the ego avoids the other vehicle by braking from now on.
 
-    The other keeps its velocity. In the ego's axes it is beside nobody's path while its shadow on y is
-    apart from the ego's, that is but for an interval of time; there, with x the distance of the centres
-    ahead, `x(t) = x0 + u_o t - (v t - b t^2 / 2)` until the ego stands, then a line. x is convex, so its
-    values in the interval lie between its least (at an end or where the speeds are equal) and the
-    greater of those at the ends; the boxes meet if that range meets [-E, E], E their half lengths along
-    x together. An oblique box counts with its bounding box in the ego's axes.
+    The ego drives at `v` (m/s) and brakes with `b_max` (m/s^2) along its heading; the other vehicle keeps its
+    velocity. In the axes of the ego both overlap in y during one interval of time only. With x the distance
+    of the centres ahead, `x(t) = x0 + u_o t - (v t - b t^2 / 2)` until the ego stands, then a line. x is
+    convex. Its values in the interval lie between its least (at an end, or where the speeds are equal) and
+    the greater of those at the ends. The boxes meet if that range meets [-E, E], with E the sum of their
+    half lengths along x. An oblique box counts with its bounding box in the axes of the ego.
     """
     along, across = reach(e)
     v = jnp.broadcast_to(v, e.x.shape)
     speed = jnp.where(v > 0, v, 0)
     brake = jnp.broadcast_to(b_max, e.x.shape)
     zero = jnp.zeros_like(e.x)
-    horizon = jnp.full_like(e.x, 30.0)  # s: by then who brakes stands
+    horizon = jnp.full_like(e.x, 30.0)  # s: by then a braking ego stands
     # when the other is in the way
     still = jnp.abs(e.w) < 1e-6
     inverse = 1 / jnp.where(still, 1.0, e.w)
@@ -163,9 +164,9 @@ class Onset(NamedTuple):
 
 
 class ContactCarry(NamedTuple):
-    """What `contact_update` remembers. The worst new contact of the first step with any is described."""
+    """Memory of `contact_update`; it describes the worst contact of the first step with any."""
 
-    notes: Int[Array, " N"]  # bits: `Onset`, then is a hazard, has touched the ego since it entered
+    notes: Int[Array, " N"]  # bits: `Onset`, is a hazard, has touched the ego since it entered
     contacts: Int[Array, ""]
     faults: Int[Array, ""]  # those at fault by nuPlan's rules
     fault_now: Bool[Array, ""]  # one of them in this step
@@ -179,7 +180,7 @@ class ContactCarry(NamedTuple):
 
     @property
     def touched(self) -> Bool[Array, " N"]:
-        """Who has touched the ego since it entered."""
+        """Vehicles that have touched the ego since they entered."""
         return (self.notes & _TOUCHED) > 0
 
 
@@ -191,7 +192,7 @@ _SEVERITY = 16.0  # steps per m/s in a key, up to 256 m/s
 def contact_init(vehicles: int) -> ContactCarry:
     """No contact, no hazard. Raises `ValueError` for more than 4096 slots."""
     if vehicles > _SLOTS:
-        raise ValueError(f"{vehicles} slots; contacts are told apart for up to {_SLOTS}")
+        raise ValueError(f"{vehicles} slots; contacts are distinguished in up to {_SLOTS}")
     zero, none, no = jnp.zeros(()), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
     return ContactCarry(
         notes=jnp.zeros(vehicles, jnp.int32),
@@ -340,7 +341,7 @@ def _judged(
 
 
 def contact_result(carry: ContactCarry) -> dict[str, Measured]:
-    """Counts, and what is known of the first contact; its numbers are invalid without one."""
+    """Counts, and the first contact in detail, which is invalid without one."""
     any_contact = carry.contacts > 0
 
     def number(x: Array) -> Float[Array, ""]:

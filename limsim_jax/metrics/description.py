@@ -1,4 +1,4 @@
-"""What a column of results is: meaning, formula, source, and where a report shows it."""
+"""Descriptions of the columns of results: meaning, formula, source, place in a report."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Description:
 
     @property
     def sign(self) -> int:
-        """1 if higher values are better, -1 if lower ones are, 0 if neither."""
+        """1 if higher values are better, -1 if lower ones, 0 otherwise."""
         return {"higher": 1, "lower": -1, "neither": 0}[self.better]
 
     @property

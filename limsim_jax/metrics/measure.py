@@ -1,4 +1,4 @@
-"""What a metric is: `Metric` for one of your own, `Measure` for the built-in ones that share a memory.
+"""Base classes: `Metric` for metrics of your own, `Measure` for built-in ones.
 
     class SlowTime(lj.Metric):
         name, unit, better = "slow_time", "s below 2 m/s", "lower"
@@ -54,14 +54,18 @@ class Metric:
         raise NotImplementedError
 
     def update(self, carry: Any, step: StepView) -> Any:
-        """The memory after a physics step of the ego, of the same shapes and types.
+        """The memory after a physics step of the ego.
 
-        Called from the first step that the ego drives until it arrives or leaves.
+        It keeps its shapes and types. Called from the first step that the ego drives until it arrives or
+        leaves.
         """
         raise NotImplementedError
 
     def result(self, carry: Any) -> Any:
-        """The value at the end: a scalar, or a scalar `Measured`. Values that are not finite are missing."""
+        """The value at the end: a scalar, or a scalar `Measured`.
+
+        A value that is not finite is missing.
+        """
         raise NotImplementedError
 
     @property
@@ -80,7 +84,7 @@ class Metric:
 
 
 class Derived(NamedTuple):
-    """What contacts and filters find in a step, for the measures that build on them."""
+    """Findings of a step that several measures build on."""
 
     contacts: ContactCarry  # after this step
     hit: Bool[Array, ""]  # a new contact in this step
@@ -89,7 +93,7 @@ class Derived(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """An episode at its end, for measures that judge it as a whole."""
+    """An episode at its end, for measures of the whole."""
 
     started: Bool[Array, ""]  # the ego was on the road
     arrived: Bool[Array, ""]
@@ -123,7 +127,7 @@ class Measure:
     columns: ClassVar[tuple[Description, ...]]
 
     def init(self, slots: int, zones: int) -> Any:
-        """The memory before the first step, for this many slots and conflict zones."""
+        """The memory before the first step; the numbers are those of slots and conflict zones."""
         return ()
 
     def update(self, carry: Any, step: StepView, derived: Derived) -> Any:
@@ -151,14 +155,17 @@ class Own(Measure):
         return jax.tree.map(lambda x, y: jnp.where(step.drove, x, y), new, carry)
 
     def result(self, carry: Any, summary: Summary) -> dict[str, Measured]:
-        """The value, missing where the metric says so, where it is not finite, or without a drive."""
+        """The value.
+
+        Missing where the metric says so, where it is not finite, or if the ego drove no step.
+        """
         found = self.metric.result(carry)
         value, valid = found if isinstance(found, Measured) else (found, True)
         value = jnp.asarray(value).astype(summary.duration.dtype)
         return {self.metric.name: measured(value, valid & jnp.isfinite(value) & summary.driven)}
 
     def check(self, step: StepView) -> None:
-        """Trace the metric once, on a step of the world that it is for.
+        """Trace the metric once, on a step of its world.
 
         Raises:
           ValueError: a memory that changes its shape or type, or a result that is no scalar; one line.

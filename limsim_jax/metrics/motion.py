@@ -38,13 +38,13 @@ Floats = NDArray[np.float64]
 
 
 class Filter(NamedTuple):
-    """A linear filter of a stream: `M` samples in sight, of which it judges the one at `H`."""
+    """A linear filter of a stream: it sees `M` samples and filters the one at `H`."""
 
     head: Floats
     """[H+1, M], from the first M samples to the values at the first H + 1; the last row is that of
     the middle of an episode."""
     tail: Floats
-    """[M-1-H, M], from the last M samples to the values at those after the last judged one."""
+    """[M-1-H, M], from the last M samples to the values at those after the last filtered one."""
 
     @property
     def window(self) -> int:
@@ -53,9 +53,11 @@ class Filter(NamedTuple):
 
 
 def stream(filter_all: Callable[[Floats], Floats], longest: int) -> Filter:
-    """The weights of a linear filter, given as a function of a whole record (samples along axis 0).
+    """The weights of a linear filter that is given as a function.
 
-    `longest` is a number of samples that no output looks further than. Found by filtering unit impulses.
+    The function filters a whole record, samples along axis 0; no output may look further than `longest` of
+    them. The weights are found by filtering unit impulses.
+
     Raises `ValueError` if outputs at the ends of a record look further than those in its middle.
     """
     n = 6 * longest
@@ -102,7 +104,7 @@ def filter_update(
 
 
 def filter_result(filter: Filter, carry: FilterCarry) -> tuple[Float[Array, "R C"], Bool[Array, " R"]]:
-    """The values that the end of the record leaves, and which of them exist."""
+    """The values known only at the end of a record, with validity."""
     valid = jnp.broadcast_to(carry.taken >= filter.window, filter.tail.shape[:1])
     return _apply(filter.tail, carry.samples), valid
 
@@ -125,7 +127,7 @@ class Filters(NamedTuple):
 
 @functools.cache
 def filters(dt: float) -> Filters:
-    """nuPlan's filters at time step `dt` (s), with windows as long in seconds as nuPlan's at 0.1 s."""
+    """nuPlan's filters at time step `dt` (s), with windows as long."""
     from scipy.signal import savgol_filter
 
     def window(samples: int, order: int) -> int:
@@ -275,7 +277,7 @@ def _reduce(
 
 
 def motion_result(dt: float, carry: MotionCarry) -> dict[str, Measured]:
-    """Extremes of all quantities, root mean squares, and whether all stay within `COMFORT`."""
+    """Extremes, root mean squares, and whether all quantities stay within `COMFORT`."""
     carry, _ = motion_flush(dt, carry)
     low, high, found = carry.least.value, -carry.most.value, carry.least.found
     results = {

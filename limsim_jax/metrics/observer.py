@@ -1,4 +1,4 @@
-"""What `Rollout.measure` takes: `EvaluateEgo` for one ego, `EvaluateEgos` for several, `EvaluateTraffic`.
+"""Metrics of a rollout: `EvaluateEgo` for one ego, `EvaluateEgos`, `EvaluateTraffic`.
 
 A `StepRecord` is what a physics step leaves behind. After every decision its records go through the metrics.
 """
@@ -56,7 +56,7 @@ class StepRecord(NamedTuple):
 
 
 class EgoState(NamedTuple):
-    """Metrics of an ego, and what its record needs of the steps before."""
+    """Metrics of an ego, and what is known from its earlier steps."""
 
     metrics: EgoCarry
     goal: Int[Array, "*e"]  # at the start: another one is no arrival
@@ -146,7 +146,7 @@ class EvaluateEgo:
     def update(
         self, config: Config, lane_map: LaneMap, carry: MetricState, records: StepRecord
     ) -> MetricState:
-        """Pass the records since the last decision through the metrics, `records` `[decision_every, ...]`."""
+        """Add the records since the last decision, `[decision_every, ...]`."""
         way, other = records.way[0], records.other.max(0)
         meets = self._each(lambda slot: meets_ego(lane_map, slot, way, other), (0,))
         relevant = meets(records.ego.slot[0])
@@ -302,7 +302,7 @@ class EvaluateTraffic:
     def update(
         self, config: Config, lane_map: LaneMap, carry: TrafficCarry, records: TrafficStep
     ) -> TrafficCarry:
-        """Pass the records since the last decision through the metrics, `records` `[decision_every, ...]`."""
+        """Add the records since the last decision, `[decision_every, ...]`."""
         metrics = TrafficMetrics(config.dt)
         return lax.scan(lambda carry, step: (_flow(metrics, carry, step), None), carry, records)[0]
 

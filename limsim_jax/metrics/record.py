@@ -57,9 +57,10 @@ def after(lane_map: LaneMap, tick: Tick) -> Snapshot:
 def traffic_step(
     state: State, left: Bool[Array, " N"], time: Float[Array, ""], dx: Float[Array, " N"]
 ) -> TrafficStep:
-    """The traffic after a step at `time` (s), in which vehicles drove `dx` (m) and some `left`.
+    """The traffic after a step that ends at `time` (s).
 
-    Free speeds are those of the drivers, without any road. Lane changes are not known yet.
+    Vehicles drove `dx` (m) in it, and some `left` the map. Free speeds are those of the drivers, without any
+    road. Lane changes are not known yet.
     """
     return TrafficStep(
         t=time,
@@ -134,7 +135,7 @@ def ego_step(
 
 
 def with_leader(step: EgoStep, tick: Tick) -> EgoStep:
-    """The step with the leader on the lane, which has moved on since the decision."""
+    """The step with the leader on the lane, where it is now."""
     other, gap = (x[step.slot, 0] for x in tick.decision.obstacles)
     gap = gap + tick.x[other] - tick.x[step.slot]
     ahead = (other >= 0) & tick.state.active[other]
@@ -178,7 +179,10 @@ def _signals(
 def _speed_around(
     lane_map: LaneMap, state: State, seen: Bool[Array, " N"], slot: Int[Array, ""], following: Int[Array, ""]
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Mean speed (m/s) on the road of the ego and on its next lane, and whether others are there."""
+    """Mean speed of the vehicles around (m/s), and whether there are any.
+
+    Those on its road and on its next lane count.
+    """
     lane = state.lane[slot]
     sides = [lane, lane_map.left[lane], lane_map.right[lane]]
     sides += [lane_map.left[sides[1]], lane_map.right[sides[2]], following]
@@ -189,9 +193,9 @@ def _speed_around(
 
 
 def conflict_zones(lane_map: LaneMap, state: State, slot: Int[Array, ""], following: Int[Array, ""]) -> Zones:
-    """Conflict zones of the ego in `slot`, and which of them are occupied.
+    """Conflict zones of the ego in `slot`, and whether they are occupied.
 
-    Those on its lane, on the one before and on the `following` one.
+    Those on its lane, on the previous and on the `following` one.
     """
     table = lane_map.conflicts
     if table.foe.shape[1] == 0:  # a map where paths never meet

@@ -1,7 +1,7 @@
-"""What a scan carries instead of a trace: means, extremes, episodes.
+"""Reductions that a scan carries instead of a trace: means, extremes, episodes.
 
-Every one starts empty, takes one sample a step and ends as a `Measured`: a finite number and whether
-there was anything to measure. Samples that are masked out may be NaN.
+Each starts empty, takes one sample a step and ends as a `Measured`: a finite number and its validity.
+Samples that are masked out may be NaN.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from limsim_jax.numerics import safe_divide
 
 
 class Measured(NamedTuple):
-    """A number, and whether it means anything. Where it does not, it is 0."""
+    """A number and its validity; 0 where it is not valid."""
 
     value: Float[Array, "*b"]
     valid: Bool[Array, "*b"]
 
 
 def measured(value: Float[Array, "*b"], valid: Bool[Array, "*b"] | bool = True) -> Measured:
-    """`value` where `valid`, else 0."""
+    """`value` where `valid`, 0 elsewhere."""
     valid = jnp.broadcast_to(jnp.asarray(valid), value.shape)
     return Measured(jnp.where(valid, value, 0), valid)
 
@@ -58,7 +58,7 @@ class Mean(NamedTuple):
 
 
 class Least(NamedTuple):
-    """The least sample so far, and when it came first. For the greatest, give and take the negative."""
+    """The least sample so far and its first time; negate samples for the greatest."""
 
     value: Float[Array, "*b"]
     time: Float[Array, "*b"]  # s
@@ -86,7 +86,7 @@ class Least(NamedTuple):
 class Episodes(NamedTuple):
     """Counts how often a condition began: between `ends` and the next `begins` it goes on.
 
-    Two conditions instead of one give hysteresis: a quantity that trembles at the threshold counts once.
+    Two conditions instead of one give hysteresis: a quantity that oscillates about a threshold counts once.
     """
 
     number: Int[Array, "*b"]

@@ -1,4 +1,4 @@
-"""How close it came: time to collision, headway, distance, braking needed, RSS, severity.
+"""Surrogate safety measures: time to collision, headway, distance, DRAC, PET, RSS, delta-v.
 
 All functions take one pair or arrays of pairs alike. Metres, seconds, m/s, m/s^2; absent times are
 `NONE`, absent gaps `NO_GAP`.
@@ -40,7 +40,7 @@ EXPOSED = 3.0
 
 
 def lesser(a: Float[Array, "*b"], b: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """The lesser of two numbers: several times as fast on CPUs as `jnp.minimum`, which looks for NaN."""
+    """The lesser of two numbers; faster on CPUs than `jnp.minimum`, which checks for NaN."""
     return jnp.where(a < b, a, b)
 
 
@@ -113,7 +113,7 @@ def reach(e: Encounter) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
 
 
 def _axes(e: Encounter) -> tuple[tuple[Float[Array, "*b"], ...], ...]:
-    """Offset, relative speed and half extents along the four directions of the sides."""
+    """Offsets, relative speeds and half extents along the four side axes."""
     m = mirrored(e)  # signs do not matter: the other's axes are those of the mirrored encounter
     ex, ey = reach(e)
     mx, my = reach(m)
@@ -149,12 +149,12 @@ def distance(e: Encounter, touching: Bool[Array, "*b"] | None = None) -> Float[A
 
 
 def contact_interval(e: Encounter) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
-    """When boxes that keep velocity and heading begin and cease to touch, s from now.
+    """When moving boxes begin and cease to touch, s from now.
 
-    Both may be negative: they touched in the past. If they never touch, `begin > cease`.
+    They keep velocity and heading. Negative times lie in the past. If they never touch, `begin > cease`.
     """
     # Fractions are compared by cross multiplication, and divided last: one division instead of four, and
-    # XLA keeps the result of a division instead of working it out again for everyone who needs it.
+    # XLA keeps the result of a division instead of computing it again for each use.
     begins, ceases = [], []
     for offset, speed, extent in zip(*_axes(e), strict=True):
         toward = jnp.where(speed < 0, -offset, offset)
@@ -187,7 +187,10 @@ def ttc_2d(e: Encounter) -> Float[Array, "*b"]:
 
 
 def ttc_1d(gap: Float[Array, "*b"], v: Float[Array, "*b"], v_lead: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Time until a follower at `v` meets a leader `gap` m ahead at `v_lead`, s; `NONE` if it falls back."""
+    """Time until a follower meets its leader, s; `NONE` if the gap does not close.
+
+    `v`, `v_lead`: their speeds, m/s; `gap`: m, bumper to bumper.
+    """
     closing = v - v_lead
     found = (closing > 0) & (gap < NO_GAP)
     time = jnp.maximum(gap, 0) / jnp.where(found, closing, 1)
@@ -195,15 +198,18 @@ def ttc_1d(gap: Float[Array, "*b"], v: Float[Array, "*b"], v_lead: Float[Array, 
 
 
 def time_headway(gap: Float[Array, "*b"], v: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Time in which a follower at `v` covers the gap to its leader, s; `NONE` at standstill."""
+    """Time in which a follower covers the gap to its leader, s; `NONE` at standstill.
+
+    `v`: its speed, m/s; `gap`: m, bumper to bumper.
+    """
     found = (v > 0) & (gap < NO_GAP)
     return jnp.where(found, jnp.minimum(jnp.maximum(gap, 0) / jnp.where(found, v, 1), NONE), NONE)
 
 
 def drac(gap: Float[Array, "*b"], v: Float[Array, "*b"], v_lead: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Braking that just avoids a leader which keeps its speed, m/s^2; 0 if the follower falls back.
+    """Deceleration that just avoids a leader of constant speed, m/s^2.
 
-    A gap below 1 cm counts as 1 cm.
+    0 if the gap does not close. A gap below 1 cm counts as 1 cm.
     """
     closing = jnp.maximum(v - v_lead, 0)
     return jnp.where(gap < NO_GAP, closing * closing / (2 * jnp.maximum(gap, 0.01)), 0)
@@ -233,13 +239,13 @@ class Rss(NamedTuple):
     brake_hardest: float = 8.0  # m/s^2, what the one ahead brakes at most
     lateral_accelerate: float = 0.2  # m/s^2
     lateral_brake: float = 0.8  # m/s^2
-    margin: float = 0.1  # m, mu: what lateral fluctuation takes
+    margin: float = 0.1  # m, mu: for lateral fluctuations
 
 
 def rss_longitudinal(
     v: Float[Array, "*b"], v_lead: Float[Array, "*b"], rss: Rss | None = None
 ) -> Float[Array, "*b"]:
-    """Safe distance of a follower at `v` behind a leader at `v_lead`, m (Lemma 2)."""
+    """Safe distance of a follower behind its leader, m (Lemma 2); speeds in m/s."""
     p = Rss() if rss is None else rss
     after = v + p.response * p.accelerate
     distance = v * p.response + p.accelerate * p.response**2 / 2 + after * after / (2 * p.brake)
@@ -269,11 +275,11 @@ class Zones(NamedTuple):
 
     id: Int[Array, " Z"]  # which conflict zone; -1 for none, no other number twice
     ego: Bool[Array, " Z"]  # the ego is in it
-    other: Bool[Array, " Z"]  # somebody else is in it
+    other: Bool[Array, " Z"]  # another vehicle is in it
 
 
 class PetCarry(NamedTuple):
-    """What `pet_update` remembers of each zone."""
+    """Memory of `pet_update`, for each zone."""
 
     id: Int[Array, " Z"]
     ego: Bool[Array, " Z"]
@@ -284,7 +290,7 @@ class PetCarry(NamedTuple):
 
 
 def pet_init(zones: int) -> PetCarry:
-    """Nobody has been in any of this many zones."""
+    """No vehicle has been in any of the `zones`."""
     nothing, never = jnp.zeros(zones, bool), jnp.full(zones, -NONE)
     return PetCarry(jnp.full(zones, -1, jnp.int32), nothing, nothing, never, never, Least.empty())
 
@@ -292,7 +298,7 @@ def pet_init(zones: int) -> PetCarry:
 def pet_update(carry: PetCarry, t: Float[Array, ""], zones: Zones) -> PetCarry:
     """One step at time `t` (s); the result is `carry.least`, exact to one step.
 
-    A zone is forgotten when it is not among `zones` any more: keep it for as long as a PET may matter.
+    A zone is forgotten once it is not among `zones`: keep it for as long as a PET may matter.
     """
     exists = zones.id >= 0
     same = (zones.id[:, None] == carry.id[None, :]) & exists[:, None]  # [now, before]

@@ -32,7 +32,7 @@ failure                 0.6 whenever the goal is not         0.6 for a contact b
 
 Two differences from the released code remain in both: its TTC moves boxes along lane centre lines with
 their present heading, ours goes straight on (see `safety.ttc_2d`); and it counts every speed above the
-limit, we those above it by `OVER_LIMIT`, lest rounding decide on who drives at the limit.
+limit, we those above it by `OVER_LIMIT`, since rounding would decide at the limit itself.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ LIMSIM_TTC = 5.0
 """s: TTC at which LimSim++'s safety is 1."""
 
 OVER_LIMIT = 0.01
-"""m/s: speeding is what exceeds the limit by more; who drives at the limit is above it by rounding."""
+"""m/s above the limit that do not count: rounding brings a vehicle at the limit above it."""
 
 Scalar = Float[Array, "*b"]
 Number = Float[Array, "*#b"] | Int[Array, "*#b"] | float | int
@@ -165,10 +165,10 @@ def nuplan_score(episode: NuPlanEpisode) -> NuPlanScore:
 def nuplan_ttc(
     begin: Float[Array, "*b"], cease: Float[Array, "*b"], relevant: Bool[Array, "*b"]
 ) -> Bool[Array, "*b"]:
-    """Whether contact intervals (`safety.contact_interval`) keep nuPlan's bound, as its time grid sees them.
+    """Whether contact intervals keep nuPlan's bound on the TTC.
 
-    nuPlan looks at 0.1, 0.2, ... s only: a shorter touch between two of these times is not seen, and a
-    contact at 0.92 s is found at 1.0 s.
+    Intervals as of `safety.contact_interval`. nuPlan checks 0.1, 0.2, ... s only: it misses a shorter
+    touch between two of these times, and a contact at 0.92 s is found at 1.0 s.
     """
     bound, step = NUPLAN_TTC
     first = jnp.maximum(jnp.ceil(begin / step - 1e-4), 1) * step
@@ -236,7 +236,10 @@ def carla_score(
 
 
 def limsim_piecewise(x: Scalar, bounds: tuple[float, float, float]) -> Scalar:
-    """1 up to the cautious bound of |x|, linear to 0.6 at the normal, linear to 0 at the aggressive one."""
+    """Score of |x|: 1 up to the cautious bound, 0 from the aggressive one on.
+
+    Linear from 1 to 0.6 at the normal bound, and from there to 0.
+    """
     cautious, normal, aggressive = bounds
     x = jnp.abs(x)
     first = jnp.clip((x - cautious) / (normal - cautious), 0, 1)
@@ -398,7 +401,10 @@ def _where(condition: Bool[Array, ""], new: LimSimSecond, old: LimSimSecond) -> 
 
 
 def _add_samples(carry: LimSimCarry, filtered: Filtered) -> LimSimCarry:
-    """Score filtered values that have become known, each of the four quantities at its own pace."""
+    """Score the filtered values that have become known.
+
+    Accelerations and jerks become known at different times.
+    """
     accelerations, new_a, jerks, new_j = filtered
     scores = (
         *limsim_comfort(accelerations[:, 0], accelerations[:, 1], accelerations[:, 0], accelerations[:, 0])[
@@ -414,7 +420,10 @@ def _add_samples(carry: LimSimCarry, filtered: Filtered) -> LimSimCarry:
 
 
 class LimSimScore(NamedTuple):
-    """Drive score, its product with route completion (both 0 to 100), and the parts (0 to 1)."""
+    """The score of an episode and its parts.
+
+    `total` and `drive` are 0 to 100, the parts 0 to 1.
+    """
 
     total: Float[Array, ""]
     drive: Float[Array, ""]
@@ -466,7 +475,7 @@ def limsim_faithful(
 def limsim_corrected(
     carry: LimSimCarry, rest: Filtered, *, failed: Bool[Array, ""], completion: Float[Array, ""]
 ) -> LimSimScore:
-    """The corrected version. `rest`: what `motion_flush` leaves; `failed`: at fault, or off the road."""
+    """The corrected version. `rest`: of `motion_flush`; `failed`: at fault, or off the road."""
     comfort = _add_samples(carry, rest).corrected_comfort.result()
     return limsim_score(
         comfort=comfort.value.mean(),

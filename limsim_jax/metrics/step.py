@@ -162,7 +162,10 @@ class StepView:
 
     @cached_property
     def contact_interval(self) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
-        """When bodies that keep their velocities begin and cease to touch the ego, s from now."""
+        """When bodies begin and cease to touch the ego, s from now.
+
+        Bodies keep their velocities.
+        """
         return contact_interval(self.encounter)
 
     @cached_property
@@ -249,5 +252,5 @@ class StepView:
 
     @property
     def d(self) -> Float[Array, ""]:
-        """Offset of the ego from the centre of its lane, m, left > 0."""
+        """Offset of the ego from its lane centre, m, left > 0."""
         return self.state.d[self.slot]

@@ -112,16 +112,16 @@ NAMES = {column.name.removeprefix("traffic_"): column.meaning for column in DESC
 
 
 class TrafficStep(NamedTuple):
-    """What a step of the traffic looks like: `N` slots, after the step."""
+    """The traffic after a step, in `N` slots."""
 
     t: Float[Array, ""]  # s
     active: Bool[Array, " N"]
     lane: Int[Array, " N"]
     s: Float[Array, " N"]  # m, front bumper
-    dx: Float[Array, " N"]  # m travelled in this step, also by those who left in it
+    dx: Float[Array, " N"]  # m travelled in this step, also by vehicles that left in it
     v: Float[Array, " N"]  # m/s
     v_free: Float[Array, " N"]  # m/s, speed without others
-    inside: Bool[Array, " N"]  # in the region that is measured; for those who left, before they did
+    inside: Bool[Array, " N"]  # in the region that is measured; of a vehicle that left: before
     changed: Bool[Array, " N"]  # crossed into the lane beside in this step
     left: Bool[Array, " N"]  # left the map at its goal in this step
     entered: Float[Array, " N"]  # s, when it entered
@@ -233,8 +233,11 @@ class TrafficMetrics:
         return carry._replace(active=step.active, lane=step.lane, s=step.s)
 
     def _detect(self, carry: TrafficCarry, detectors: Detectors, step: TrafficStep) -> TrafficCarry:
-        """Who has passed which detector. A lane change is no passage; the lane that it leads to counts."""
-        drove = carry.active & (step.active | step.left)  # nobody is active before the start
+        """Passages of the detectors.
+
+        A lane change is none; the new lane counts.
+        """
+        drove = carry.active & (step.active | step.left)  # no vehicle is active before the start
         handed_over = step.left | ((step.lane != carry.lane) & (step.s <= step.dx))
         place, lane = detectors.s[:, None], detectors.lane[:, None]  # [D, 1]
         on_now = (lane == step.lane[None]) & ~step.left[None]
@@ -273,7 +276,7 @@ class TrafficMetrics:
         )
 
     def result(self, carry: TrafficCarry, length: Float[Array, ""] | float) -> dict[str, Measured]:
-        """The flow in the region, which has lanes of `length` m in all."""
+        """The flow in a region whose lanes have a total `length` (m)."""
         duration = carry.now - carry.start
         some, driven = duration > 0, carry.distance > 0
         area = duration * length

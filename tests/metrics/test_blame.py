@@ -1,4 +1,4 @@
-"""Contacts of every type, who is at fault, and whether braking would have helped."""
+"""Contacts of every type, fault, and whether braking would have helped."""
 
 import jax
 import jax.numpy as jnp
@@ -222,13 +222,13 @@ def always(*flags):
         # it is run into
         ((0, 0, 0, 5.0), (-40, 0, 0, 15.0), {}, T.REAR, R.OTHER),
         ((0, 0, 0, 0.0), (-30, 0, 0, 10.0), {}, T.STOPPED_EGO, R.OTHER),
-        # somebody who changes lanes comes too near to brake: 6 m at 15 m/s
+        # a vehicle that changes lanes comes too near to brake: 6 m at 15 m/s
         ((0, 0, 0, 25.0), (11, 0, 0, 10.0), {"changing": always(0, 1, 0)}, T.FRONT, R.OTHER),
         # the same without a change of lanes: it just appears
         ((0, 0, 0, 25.0), (11, 0, 0, 10.0), {}, T.FRONT, R.UNAVOIDABLE),
         # a change of lanes that leaves room is no excuse
         ((0, 0, 0, 15.0), (45, 0, 0, 5.0), {"changing": always(0, 1, 0)}, T.FRONT, R.EGO),
-        # the ego changes lanes right in front of somebody
+        # the ego changes lanes right in front of another vehicle
         ((0, 0, 0, 10.0), (-11, 0, 0, 25.0), {"changing": always(1, 0, 0)}, T.REAR, R.EGO),
         # and in good time
         ((0, 0, 0, 5.0), (-45, 0, 0, 15.0), {"changing": always(1, 0, 0)}, T.REAR, R.OTHER),
@@ -245,10 +245,10 @@ def always(*flags):
         # only one of them: the other one's front corner meets its side
         ((0, 0, 0.08, 15.0), (-2, 3.5, 0.0, 15.0), {"changing": always(1, 0, 0)}, T.LATERAL, R.EGO),
         ((0, 0, 0.0, 15.0), (-2, 3.5, -0.08, 15.0), {"changing": always(0, 1, 0)}, T.LATERAL, R.OTHER),
-        # who has changed lanes when the hazard began is not excused by being done at the contact
+        # a vehicle that has changed lanes when the hazard began is not excused by being done at the contact
         ((0, 0, 0, 25.0), (11, 0, 0, 10.0), {"changing": lambda i: [0, i < 3, 0]}, T.FRONT, R.OTHER),
         ((0, 0, 0, 10.0), (-11, 0, 0, 25.0), {"changing": lambda i: [i < 3, 0, 0]}, T.REAR, R.EGO),
-        # nor who begins to change after that
+        # nor one that begins to change after that
         ((0, 0, 0.08, 15.0), (-2, 3.5, 0.0, 15.0), {"changing": lambda i: [i > 3, 0, 0]}, T.LATERAL, R.EGO),
         # but what was long before the hazard does not matter
         ((0, 0, 0, 15.0), (85, -54, np.pi / 2, 10.0), {"changing": lambda i: [0, i < 5, 0]}, T.FRONT, R.EGO),

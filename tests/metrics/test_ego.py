@@ -158,7 +158,7 @@ def test_a_leader_that_comes_nearer():
     assert measure(near)["ttc_exposed"] == pytest.approx(2.0, abs=1e-4)
 
 
-def test_who_is_not_relevant_or_not_there_is_not_met():
+def test_vehicles_that_are_not_relevant_or_not_active_are_not_met():
     r = closing(lead=np.full(31, -1, np.int32))
     r["relevant"][:, 1] = False
     found = measure(r)
@@ -172,7 +172,7 @@ def test_who_is_not_relevant_or_not_there_is_not_met():
     assert found["min_ttc"] is found["min_thw"] is found["min_distance"] is None
 
 
-def test_who_touches_is_met_whatever_way_it_meant_to_go():
+def test_a_vehicle_that_touches_is_met_wherever_it_is_going():
     r = record(31, (0, 0, 0, 20.0), [(30, 0, 0, 0.0)])  # it would be through the other in half a second
     assert measure(r)["contacts"] == 1.0
     r["relevant"][:, 1] = False
@@ -182,7 +182,7 @@ def test_who_touches_is_met_whatever_way_it_meant_to_go():
 
 
 def test_near_misses_are_episodes():
-    """A crossing car, twice a short TTC in between a longer one; the second time it trembles."""
+    """A crossing car, twice a short TTC in between a longer one; the second time it oscillates."""
     v = np.full(61, 10.0)
     ttc = np.concatenate(
         [np.linspace(5, 1.2, 15), np.linspace(1.4, 4, 15), [1.45, 1.6, 1.4, 1.9, 1.3] * 6, [4.0]]
@@ -231,7 +231,7 @@ def test_a_contact():
         assert found[f"limsim_{version}_drive"] == pytest.approx(60 * (c / 4 + e / 4 + s / 2), rel=1e-4)
 
 
-def test_a_contact_by_somebody_elses_fault():
+def test_a_contact_at_the_fault_of_the_other_vehicle():
     r = record(61, (0, 0, 0, 5.0), [(-20, 0, 0, 12.0)], arrived=np.arange(61) == 60)
     found = measure(r)
     assert (found["contacts"], found["at_fault_contacts"], found["success"]) == (1.0, 0.0, 0.0)
@@ -271,7 +271,7 @@ def test_nuplans_ttc_looks_ahead_and_in_junctions_aside(y, changing, junction, k
 
 @pytest.mark.parametrize(("x", "v"), [(-11.0, 10.0), (11.0, 0.0)])
 def test_nuplans_ttc_does_not_ask_for_more_than_the_ego_can_do(x, v):
-    """In a junction, somebody 0.6 s behind; and a standing ego that somebody comes to from ahead."""
+    """In a junction, a vehicle 0.6 s behind; and a standing ego with a vehicle that comes from ahead."""
     r = record(31, (0, 0, 0, v), [(x, 0, 0, 0.0)], in_junction=np.ones(31, bool))
     r["box"][:, 1, 0] = r["box"][:, 0, 0] + x
     r["velocity"][:, 1] = [v - np.sign(x) * 10.0, 0.0]
@@ -319,7 +319,7 @@ def test_against_the_flow():
     gap = np.arange(61) == 23
     heading = np.where((np.arange(61) >= 20) & (np.arange(61) < 27), np.pi, 0.0)
     assert measure(free(lane_heading=heading, on_lane=~gap))["against_flow"] == pytest.approx(2.0, abs=1e-3)
-    # who stands, or only rolls, goes nowhere
+    # an ego that stands, or only rolls, goes nowhere
     assert measure(free(v=0.0))["wrong_way"] == measure(free(v=0.05))["wrong_way"] == 0.0
     # without a lane there is no direction
     heading = np.full(61, np.pi)
@@ -385,7 +385,7 @@ def test_an_ego_that_was_lost_is_not_followed_by_another():
 def test_an_ego_that_enters_late_starts_then():
     r = free(61)
     r["active"][:5, 0] = False
-    r["arrived"] = np.arange(61) < 5  # whoever had the slot before
+    r["arrived"] = np.arange(61) < 5  # of the vehicle that had the slot before
     found = measure(r)
     assert found["duration"] == pytest.approx(5.5) and found["distance"] == pytest.approx(55.0)
     assert found["arrived"] == 0.0

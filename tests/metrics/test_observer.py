@@ -1,7 +1,6 @@
-"""What the metrics are shown of a world, against loops in NumPy over one vehicle and one lane at a time.
+"""Records of steps, against loops in NumPy over one vehicle and one lane at a time.
 
-Worlds are drawn at random, also such as hardly occur, on a crossing with lights, stop signs on some
-connectors and some lanes lifted to bridges. What other modules say of bodies and lanes is taken for given.
+The worlds are those of `observed_worlds`. Results of other modules about bodies and lanes are taken as given.
 """
 
 import dataclasses
@@ -59,7 +58,7 @@ def test_plain_columns_are_those_of_the_state():
         assert record.stopped == state.stopped[slot] and ego.off_road == np.asarray(tick.off_road)[slot]
 
 
-def test_bodies_and_who_is_on_the_same_level():
+def test_bodies_and_vehicles_on_the_same_level():
     there = 0
     for i, (tick, record) in enumerate(seen()):
         box, z, *_ = given()[i]
@@ -73,7 +72,7 @@ def test_bodies_and_who_is_on_the_same_level():
     assert there > 100
 
 
-def test_who_drives_where_others_have_priority():
+def test_vehicles_that_drive_where_others_have_priority():
     for _, state, _, _, found in each("violation"):
         for k in range(N):
             inside = state.lane[k] != NO_LANE and host().junction[state.lane[k]] >= 0
@@ -81,7 +80,7 @@ def test_who_drives_where_others_have_priority():
             assert found[k] == ((red and inside) or Status.WRONG_WAY in Status(int(state.status[k])))
 
 
-def test_who_is_in_several_lanes():
+def test_vehicles_in_several_lanes():
     for i, state, tick, _, found in each("changing"):
         for k in range(N):
             left, right = state.d[k] + state.shape.width[k] / 2, state.d[k] - state.shape.width[k] / 2
@@ -164,7 +163,7 @@ def test_waiting_at_red():
     assert found > 5 and slower > found and further > found
 
 
-def test_how_fast_the_others_around_the_ego_are():
+def test_the_speed_of_the_vehicles_around_the_ego():
     several = 0
     for i, state, _, slot, found in each("v_others"):
         m, z = host(), given()[i][1]
@@ -197,7 +196,7 @@ def parts(state, k):
     return [*([(state.lane[k], state.s[k])] if state.lane[k] != NO_LANE else []), *tail]
 
 
-def test_conflict_zones_and_who_is_in_them():
+def test_conflict_zones_and_their_occupants():
     table = host().conflicts
     count = table.foe.shape[1]
     totals = np.zeros(3, int)
@@ -257,7 +256,7 @@ def test_maps_where_paths_hardly_or_never_meet():
     assert met > 3
 
 
-def test_who_is_off_the_road_is_looked_for_where_the_engine_did_not():
+def test_vehicles_off_the_road_are_found_where_the_engine_has_not_looked():
     record = jax.jit(lambda tick: EvaluateEgo().record(CONFIG, crossing(), tick._replace(off_road=None)))
     found = []
     for (tick, _), (*_, off) in zip(seen()[:25], given()[:25], strict=True):
@@ -271,7 +270,7 @@ def test_who_is_off_the_road_is_looked_for_where_the_engine_did_not():
 # --- with a memory -----------------------------------------------------------------------------------
 
 
-def test_whose_way_may_meet_that_of_the_ego():
+def test_vehicles_whose_path_may_meet_that_of_the_ego():
     rng = np.random.default_rng(4)
     table = host().conflicts
     meets = jax.jit(meets_ego)
@@ -294,26 +293,26 @@ def test_whose_way_may_meet_that_of_the_ego():
 
 
 class Recorder:
-    """Keeps what a judge is shown."""
+    """Keeps the steps that metrics get."""
 
-    def __init__(self, judge: Any = None) -> None:
-        self.judge, self.shown = judge, []
+    def __init__(self, metrics: Any = None) -> None:
+        self.metrics, self.shown = metrics, []
 
     def init(self, *sizes: int):
         self.sizes = sizes
-        return self.judge and self.judge.init(*sizes)
+        return self.metrics and self.metrics.init(*sizes)
 
     def update(self, carry, *shown):
         steps = [x for x in shown if isinstance(x, EgoStep | TrafficStep)]
         self.shown.append(jax.tree.map(np.asarray, steps[0]))
-        return self.judge and self.judge.update(carry, *shown)
+        return self.metrics and self.metrics.update(carry, *shown)
 
     def result(self, carry, *area) -> Any:
-        return self.judge.result(carry, *area) if self.judge else {"told": carry}
+        return self.metrics.result(carry, *area) if self.metrics else {"told": carry}
 
 
 class Seats:
-    """Remembers who was where, which is all that is asked of the traffic's judge."""
+    """Remembers the places of vehicles, which is all that the traffic metrics are asked for."""
 
     def init(self, slots: int, _: int) -> TrafficStep:
         return self.update(None, None, stories()[0][2][0].traffic._replace(active=np.zeros(slots, bool)))
@@ -325,7 +324,7 @@ class Seats:
 class Watched(EvaluateEgo):
     pair: Any = None
 
-    def judge(self, ego, traffic):
+    def watch(self, ego, traffic):
         object.__setattr__(self, "pair", (ego, traffic))
         return self
 
@@ -363,10 +362,10 @@ def stories():
     return told
 
 
-def play(slot, ticks, records, judge):
-    """What the judges were shown: at the start, and over two decisions of the rest."""
-    ego, traffic = Recorder(), Recorder(judge)
-    watch = Watched().judge(ego, traffic)
+def play(slot, ticks, records, metrics):
+    """What the metrics got: at the start, and over two decisions of the rest."""
+    ego, traffic = Recorder(), Recorder(metrics)
+    watch = Watched().watch(ego, traffic)
     with jax.disable_jit():
         carry = watch.init(CONFIG, crossing(), jax.tree.map(jnp.asarray, ticks[0].state))
         carries = [carry]
@@ -392,7 +391,7 @@ def test_progress_arrival_and_signs_over_time():
         assert len(ego.shown) == len(records) + 1
         for t, step in enumerate(ego.shown):
             flow = traffic.shown[t]
-            if t == 0:  # the start: nobody has moved or left
+            if t == 0:  # the start: no vehicle has moved or left
                 state, left, dx = start, np.zeros(N, bool), np.zeros(N)
                 assert step.t == 0 and not step.red_light and not step.off_road and not flow.left.any()
                 assert not step.stop_sign and step.lead == -1 and step.lead_gap == NO_GAP
@@ -445,18 +444,18 @@ def test_progress_arrival_and_signs_over_time():
     assert min(totals.values()) > 0, totals
 
 
-def test_the_judges_get_the_time_step_and_as_many_slots_as_there_are():
+def test_metrics_get_the_time_step_and_the_number_of_slots():
     slot, ticks, records = stories()[0]
     _, ego, traffic = play(slot, ticks, records, Seats())
     assert ego.sizes == (N, records[0].ego.zones.id.size) and traffic.sizes == (N, 0)
-    judges = EvaluateEgo()._metrics(Config(dt=0.05))
-    assert [judge.dt for judge in judges] == [0.05, 0.05]
+    metrics = EvaluateEgo()._metrics(Config(dt=0.05))
+    assert [one.dt for one in metrics] == [0.05, 0.05]
 
 
 def test_density_is_over_the_length_of_all_lanes():
     slot, ticks, records = stories()[0]
     carries, _, traffic = play(slot, ticks, records, TrafficMetrics(CONFIG.dt))
-    found = Watched().judge(Recorder(), traffic).result(CONFIG, crossing(), carries[-1])
+    found = Watched().watch(Recorder(), traffic).result(CONFIG, crossing(), carries[-1])
     total = sum(float(x) for x, valid in zip(host().length, host().valid, strict=True) if valid)
     given = traffic.result(carries[-1].traffic, jnp.float32(total))
     assert set(found) == {"told"} | {f"traffic_{name}" for name in given}

@@ -278,7 +278,7 @@ def one_zone(ego, other, n=40):
         ((5, 10), (10, 12), 0.0, 1.0),  # one out, other in
         ((5, 10), (8, 12), 0.0, 0.8),  # together
         ((5, 10), (5, 12), 0.0, 0.5),  # in at the same step
-        ((5, 10), (90, 91), None, None),  # nobody else
+        ((5, 10), (90, 91), None, None),  # no other vehicle
         ((90, 91), (5, 10), None, None),
     ],
 )

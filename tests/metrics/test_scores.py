@@ -309,7 +309,7 @@ def test_what_the_corrected_version_corrects():
     for excess, counts in (0.005, False), (0.015, True):
         at_limit = drive(steady | {"v": steady["limit"] + excess})
         assert [float(x.speeding) for x in at_limit] == pytest.approx([0.9 ** (10 * counts)] * 2)
-    # who arrives has completed the route, whatever is left of it
+    # an ego that arrives has completed the route, whatever is left of it
     faithful, _ = drive(steady, completion=0.98)
     assert float(faithful.total) == pytest.approx(float(faithful.drive))
     # standing still until the time is over

@@ -25,7 +25,7 @@ def record(start, v, steps, *, v_free=20.0, inside=None, changed=None):
     there = way <= ends[-1]
     left = ~there & (before <= ends[-1])
     s = way - np.concatenate([[0], ends])[lane]
-    # those who have left hold harmless numbers, as in the engine
+    # slots of vehicles that have left hold harmless numbers, as in the engine
     return {
         "t": np.arange(steps) * DT,
         "active": there,

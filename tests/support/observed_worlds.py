@@ -95,7 +95,7 @@ def around(rng, lane: int, goals) -> int:
 
 @functools.cache
 def blank() -> State:
-    """Nobody anywhere."""
+    """No vehicle anywhere."""
     nothing = np.zeros(N, np.float32)
     state = start_state(
         crossing(),
@@ -241,7 +241,7 @@ def centre(state, slot):
 
 @functools.cache
 def given():
-    """Of all random steps, from other modules: bodies, levels, widths, second lanes, headings, who is off."""
+    """Of all random steps: bodies, levels, widths, second lanes, headings, off the road."""
     state = stacked([tick.state for tick, _ in seen()])
     places = [centre(tick.state, int(tick.state.egos.slot[0])) for tick, _ in seen()]
 

@@ -1,4 +1,4 @@
-"""Driving scores of nuPlan, the CARLA leaderboard and LimSim++, as measures over an episode."""
+"""Driving scores of nuPlan, the CARLA leaderboard and LimSim++ as measures."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class NuPlan(Measure):
         ),
         _nuplan(
             "nuplan_no_at_fault_collisions", "0, 0.5 or 1, multiplier",
-            "0 with a contact at the ego's fault, else 1."
+            "0 with a contact at the ego's fault, 1 without."
         ),
         _nuplan(
             "nuplan_drivable_area", "0 or 1, multiplier", "0 if the ego was ever off the drivable area.",
@@ -70,7 +70,7 @@ class NuPlan(Measure):
         ),
         _nuplan(
             "nuplan_driving_direction", "0, 0.5 or 1, multiplier",
-            "1 for against_flow below 2 m, 0.5 below 6 m, else 0."
+            "1 for against_flow below 2 m, 0.5 below 6 m, 0 above."
         ),
         _nuplan(
             "nuplan_making_progress", "0 or 1, multiplier", "1 if nuplan_progress is above 0.2.", "proportion"
@@ -98,7 +98,7 @@ class NuPlan(Measure):
         return NuPlanCarry(jnp.ones((), bool), jnp.zeros(()))
 
     def update(self, carry: NuPlanCarry, step: StepView, derived: Derived) -> NuPlanCarry:
-        """Add the TTC of this step as nuPlan sees it, and the way of the reference."""
+        """Add nuPlan's view of the TTC, and the distance of the reference."""
         record, contacts = step.record, derived.contacts
         e, (begin, cease) = step.encounter, step.contact_interval
         sideways = (record.changing[step.slot] | record.in_junction) & ~behind(e, record.rear_axle)
