@@ -18,9 +18,11 @@ from .maps.map import Map as Map
 from .maps.map import load_map as load_map
 from .maps.network import MapError as MapError
 from .maps.network import Network as Network
+from .metrics.measure import Metric as Metric
 from .policies.area import AreaOfInterest as AreaOfInterest
 from .policies.base import LikeTraffic as LikeTraffic
 from .policies.base import Policy as Policy
+from .policies.base import named as named
 from .policies.host import HostPolicy as HostPolicy
 from .policies.host import Observation as Observation
 from .policies.limsim_tm import LimSimTM as LimSimTM

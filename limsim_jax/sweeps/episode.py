@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import numpy as np
@@ -25,12 +25,12 @@ from limsim_jax.maps.network import Network
 from limsim_jax.maps.xml import file_hash
 from limsim_jax.metrics.catalog import TOTALS
 from limsim_jax.metrics.measure import Metric
+from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos, EvaluateTraffic
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.policies.base import PolicyLike, check_policy
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.totals import Totals
 from limsim_jax.simulation.worlds import Worlds
-from limsim_jax.sweeps._shim import EvaluateEgo, EvaluateTraffic
 from limsim_jax.sweeps.build import (
     demand_of,
     describe,
@@ -135,11 +135,18 @@ class Episodes:
         return self.town.lanes
 
     def _measures(self, metrics: tuple[Metric, ...]) -> EvaluateEgo | EvaluateTraffic:
-        if self.egos:
-            return EvaluateEgo(egos=self.egos, metrics=metrics)
-        if metrics:
-            self._refuse("metrics", f"'{metrics[0].name}' is of an ego, and there is none")
-        return EvaluateTraffic()
+        if not self.egos:
+            if metrics:
+                self._refuse("metrics", f"'{metrics[0].name}' is of an ego, and there is none")
+            return EvaluateTraffic()
+        try:
+            return (
+                EvaluateEgo(metrics=metrics)
+                if self.egos == 1
+                else EvaluateEgos(count=self.egos, metrics=metrics)
+            )
+        except ValueError as error:
+            self._refuse("metrics", str(error))
 
     def _units(self) -> dict[str, str]:
         units = dict(self._measure.units)
@@ -147,7 +154,7 @@ class Episodes:
             units = {"success": "1 if the criteria of the experiment are met"} | units
         return units | {total.name: total.meaning for total in TOTALS}
 
-    def _refuse(self, field: str, message: str) -> None:
+    def _refuse(self, field: str, message: str) -> NoReturn:
         raise ExperimentError(f"{self.experiment.name}: {field}: {message}")
 
     def _check_success(self) -> None:
