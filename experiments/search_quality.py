@@ -35,6 +35,7 @@ from limsim_jax.policies.limsim_tm.search import (
 )
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.types import Driver
+from limsim_jax.xla import batch_last
 
 RESULTS = Path(__file__).parent / "results"
 LANE_WIDTH = 3.5
@@ -178,7 +179,7 @@ def by_mctx(policy: str, settings: Settings, scenes: Scene) -> Plan:
         new = tm._decision(settings, tm._prepare(scene), scene, motion, score, action, others)[:2]
         return jax.tree.map(lambda a, b: jnp.where(k < depth, a, b), new, (motion, score))
 
-    advance = jax.vmap(tm._batch_last(step))
+    advance = jax.vmap(batch_last(step))
 
     def earned(score: Any) -> jax.Array:
         return score.reward.mean(-1)

@@ -9,7 +9,7 @@ vehicle where lanes split. There is no gradient through the choice of the lane.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -71,6 +71,7 @@ class Plans:
     heading: Float[Array, "V H"]  # rad
 
 
+@runtime_checkable
 class Predictor(Protocol):
     """Written for one world."""
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 
 from limsim_jax.geometry import wrap_angle
@@ -183,7 +183,7 @@ def score(
     return Scores(total, no_fault, drivable, direction, progress, ttc, comfort, contact)
 
 
-def _at(values: Float[Array, "V P T2"], moment: Int[Array, "V P K"]) -> Array:
+def _at(values: Shaped[Array, "V P T2"], moment: Int[Array, "V P K"]) -> Array:
     return jnp.take_along_axis(values, moment, -1)
 
 
