@@ -36,6 +36,10 @@ _limsim_tm = "decide", "group", "plan", "policy", "search"
 _hooked += [f"limsim_jax.policies.limsim_tm.{name}" for name in _limsim_tm]
 _pdm = "learned", "policy", "proposals", "road", "score", "tracker"
 _hooked += [f"limsim_jax.policies.pdm.{name}" for name in _pdm]
+_hooked += [
+    f"limsim_jax.metrics.{name}"
+    for name in ("blame", "ego", "motion", "observer", "record", "safety", "scores", "traffic", "measures")
+]
 install_import_hook(_hooked, "shape_checks.typecheck")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")

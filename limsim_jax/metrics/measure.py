@@ -23,6 +23,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.metrics.blame import ContactCarry
@@ -178,10 +179,17 @@ class Own(Measure):
                 f"metric '{name}': update returns {_types(after)}, but init {_types(before)}; "
                 "the memory keeps its structure, shapes and types"
             )
-        found = jax.eval_shape(metric.result, before)
+        jax.eval_shape(self._scalar, before)
+
+    def _scalar(self, carry: Any) -> tuple[Array, ...]:
+        found = self.metric.result(carry)
         for part in found if isinstance(found, Measured) else [found]:
-            if jnp.shape(part) != () if hasattr(part, "shape") else not isinstance(part, int | float):
-                raise ValueError(f"metric '{name}': result is {_types(part)}; a scalar is expected")
+            array = isinstance(part, jax.Array | np.ndarray | np.generic)
+            if part.shape != () if array else not isinstance(part, int | float):
+                raise ValueError(
+                    f"metric '{self.metric.name}': result is {_types(part)}; a scalar is expected"
+                )
+        return ()
 
 
 def _array(x: Any) -> Array:
@@ -206,7 +214,7 @@ def check_names(metrics: Sequence[Metric], taken: Iterable[str]) -> None:
     for metric in metrics:
         kind = type(metric).__name__
         if not isinstance(metric, Metric):
-            hint = "; pass an instance, as Headway()" if isinstance(metric, type) else ""
+            hint = f"; pass an instance, as {metric.__name__}()" if isinstance(metric, type) else ""
             raise ValueError(f"metrics: {metric!r} is no limsim_jax.Metric{hint}")
         name, unit = getattr(metric, "name", None), getattr(metric, "unit", None)
         if not isinstance(name, str) or not name.isidentifier():

@@ -68,7 +68,8 @@ def stream(filter_all: Callable[[Floats], Floats], longest: int) -> Filter:
     back, ahead = middle - reach[0], reach[-1] - middle
 
     def inner(i: int) -> bool:
-        return i >= back and i + ahead < n and np.allclose(np.roll(a[middle], i - middle), a[i], atol=1e-9)
+        moved = np.roll(a[middle], i - middle)
+        return bool(i >= back and i + ahead < n and np.allclose(moved, a[i], atol=1e-9))
 
     first = next(i for i in range(n) if inner(i))
     last = next(i for i in reversed(range(n)) if inner(i))

@@ -56,7 +56,7 @@ def measure(evaluator: Any, ticks: list[Any]) -> dict[str, Any]:
         lane_map = crossing()
         carry = evaluator.init(CONFIG, lane_map, start)
         records = jax.vmap(lambda tick: evaluator.record(CONFIG, lane_map, tick))(ticks)
-        decisions = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), records)
+        decisions = jax.tree.map(lambda x: x.reshape(STEPS // 2, 2, *x.shape[1:]), records)
 
         def update(carry, records):
             return evaluator.update(CONFIG, lane_map, carry, records), None
