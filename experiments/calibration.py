@@ -1,4 +1,4 @@
-"""Calibration of car-following models on recorded followers, beside the literature and other optimisers.
+"""Car-following models on recorded followers, beside the literature and other optimisers.
 
     python experiments/calibration.py [--data NAME ...] [--models idm ...]
         [--folder ../shared/data/trajectories]
@@ -71,7 +71,7 @@ def timed(segments: list[Segment], model: str, method: str) -> tuple[Any, float]
 
 
 def scipy_de(segments: list[Segment], model: str, count: int) -> tuple[np.ndarray, float]:
-    """Errors and seconds per driver of SciPy's differential evolution, a population at a time."""
+    """Errors and seconds per driver of SciPy's differential evolution."""
     _, data, dt = stack(segments)
     low, high = np.asarray(LOWER), np.asarray(UPPER)
     one = jax.tree.map(lambda x: jnp.asarray(x[0]), data)

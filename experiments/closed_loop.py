@@ -81,7 +81,10 @@ def recordings(folder: Path, name: str) -> dict[str, Any]:
 
 
 def saturation_engine() -> Engine:
-    """Cars straight on over the bundled crossing, more than the lights let through: queues never end."""
+    """Cars straight on over the bundled crossing.
+
+    There are more than the lights let through: queues never end.
+    """
     network = read_network(bundled_maps()["intersection"])
     goals = default_goals(network)
     lane_map = build_lane_map(network, goals)
@@ -132,7 +135,7 @@ def recorded_lane_changes(folder: Path) -> dict[str, float]:
 
 
 def matched(engine: Engine, statistic: str, target: float, **options: Any) -> dict[str, Any]:
-    """Factors on medians that give the statistic its target, and what it is for other seeds."""
+    """Factors on medians that give a statistic its target; held-out seeds."""
     begin = time.perf_counter()
     seeds, others = options.pop("seeds"), options.pop("others")
     found = match(
@@ -172,7 +175,7 @@ def saturation(folder: Path) -> dict[str, Any]:
 
 
 def lane_changes(folder: Path) -> dict[str, Any]:
-    """Factors on the politeness and the threshold for the lane changes of the US-101 scenes."""
+    """Factors on politeness and threshold for the lane changes of US-101."""
     recorded = recorded_lane_changes(folder)
     found = matched(
         lane_change_engine(recorded["density"]), "lane_changes_per_km", recorded["fitted"], seeds=range(2),
@@ -195,12 +198,12 @@ def table(found: dict[str, Any]) -> str:
     sets = [found[name] for name in SOURCES if name in found]
     if sets:
         lines += [
-            "Followers simulated behind one another; only who has no leader in the recording follows its",
-            "log. Distances from the recording: Wasserstein-1 of time headways, speeds and gaps, difference",
-            "of mean speeds, and of flows at equal densities (Edie). Drivers drawn from: the simulator's",
-            "default population, the population of fits to single drivers, and that one adjusted in closed",
-            "loop. *Held out*: every period is simulated with populations that were fitted without it, in",
-            "three turns; distances of all periods together. *Halves*: between two halves of the recorded",
+            "Followers simulated behind one another; only those without a leader in the recording follow",
+            "their logs. Distances from the recording: Wasserstein-1 of time headways, speeds and gaps,",
+            "difference of mean speeds, and of flows at equal densities (Edie). Drivers drawn from:",
+            "the simulator's default population, the population of fits to single drivers, and that one",
+            "adjusted in closed loop. *Held out*: every period is simulated with populations that were",
+            "fitted without it, in three turns; distances of all periods together. *Halves*: between two halves of the recorded",
             "drivers. *Own record*: of a record that the populations of closed loop have made themselves,",
             "with other draws of their drivers; as far is one that is exactly right.",
             "ACC-IDM, the model of the simulator's traffic.",

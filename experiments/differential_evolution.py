@@ -54,7 +54,7 @@ def fit_by_evolution(
 def _differential_evolution(
     problem: Problem, u: Array, data: Data, key: Key[Array, ""], generations: int
 ) -> tuple[Array, Array]:
-    """best/1/bin with dithering from populations `u [D, M, P]` in the unit box; best points and costs."""
+    """best/1/bin with dithering from populations `u [D, M, P]`; best points and costs."""
     size = u.shape[-2]
 
     def evolve(u: Array, key: Array, data: Data) -> tuple[Array, Array]:

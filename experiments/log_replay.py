@@ -44,7 +44,10 @@ AFTER = 1.0  # s after its first entry, or after the start of the benchmark's ra
 
 
 def platoon(cars: int = 12, seconds: float = 60.0, dt: float = 0.1) -> Tracks:
-    """A made platoon of different cars on one lane, whose speed waves gently: long enough to come back."""
+    """A made-up platoon on one lane, whose speed waves gently.
+
+    It is recorded for long enough to come back to the log.
+    """
     t = np.arange(round(seconds / dt)) * dt
     v = 15 + 2 * np.sin(2 * np.pi * t / 25)
     way = np.append(0, np.cumsum((v[1:] + v[:-1]) / 2)) * dt
@@ -109,7 +112,7 @@ def measure(recorded: Tracks) -> list[dict[str, Any]]:
 
 
 def driven(recorded: Tracks) -> list[dict[str, Any]]:
-    """Planners at the wheel of each vehicle in turn, until its log ends."""
+    """Planners at the wheel of each vehicle, until its log ends."""
     lane_map = build_lane_map(recorded.network)
     scene = build_arrays(recorded, lane_map)
     egos = egos_of(scene, (0.0, 1e6), DRIVEN)
@@ -206,7 +209,7 @@ def table(rows: list[dict[str, Any]], policies: list[dict[str, Any]], bench: dic
         f"With the ego on its log: {said}. Pairs that overlap in the logs themselves: {logged}; they are not",
         "counted as contacts. The share is that of the takeovers that were seen through, in recordings of at",
         f"least {LONG:g} s and of egos that clear the way: on the 100 to 200 m of road of the others most",
-        "vehicles leave before, and behind an ego that stays nobody can go back.",
+        "vehicles leave before, and behind an ego that stays no vehicle can go back.",
         "",
         f"Planners at the wheel of {policies[0]['egos']} vehicles of {policies[0]['scene']} in turn, each",
         f"from {AFTER:g} s after its first moment to the end of its log:",
@@ -244,7 +247,7 @@ def main() -> None:
     files = sorted((options.data / "commonroad").glob("*.xml.gz"))
     if not files:
         raise SystemExit(
-            f"{options.data}: no commonroad/*.xml.gz; the folder of recorded trajectories would be right"
+            f"{options.data}: no commonroad/*.xml.gz; the folder of recorded trajectories is expected"
         )
     path = RESULTS / "log_replay.json"
     found = json.loads(path.read_text()) if path.exists() and set(options.part) != set(PARTS) else {}

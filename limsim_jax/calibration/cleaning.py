@@ -72,7 +72,7 @@ class Segment:
 
 @dataclass(kw_only=True)
 class Quality:
-    """What a file holds and what became of it."""
+    """What a file holds, and how much of it is kept."""
 
     source: str
     kind: str
@@ -153,7 +153,7 @@ def segments(
     if not found:
         why = ", ".join(f"{reason}: {seconds:.0f} s" for reason, seconds in quality.dropped.items())
         raise RecordingError(
-            f"{r.source}: {r.row} {r.line[0]}: nobody follows a leader for {shortest:g} s; of "
+            f"{r.source}: {r.row} {r.line[0]}: no vehicle follows a leader for {shortest:g} s; of "
             f"{quality.recorded:.0f} s recorded were dropped: {why or 'none'}"
         )
     quality.kept = sum(segment.duration for segment in found)
@@ -235,7 +235,7 @@ def _stretches(r: Recording, bad: NDArray[np.bool_]) -> tuple[NDArray[np.int64],
 def _segment(
     r: Recording, rows: slice, dt: float, smoothing: float
 ) -> tuple[Segment, tuple[Floats, Floats], Floats]:
-    """A segment, with what its speeds differ from recorded ones and its gaps from recorded ones."""
+    """A segment, and its differences from recorded speeds and gaps."""
     time = r.time[rows]
     x_lead, v_lead = _motion(r.x_lead[rows], r.dt, smoothing)
     x, v = _motion(r.x[rows], r.dt, smoothing)
@@ -267,7 +267,7 @@ def _segment(
 
 
 def _motion(x: Floats, dt: float, smoothing: float) -> tuple[Floats, Floats]:
-    """Smoothed positions and speeds, the former being the trapezoid integral of the latter."""
+    """Smoothed positions and speeds; positions are the trapezoid integral of speeds."""
     window = max(2 * round(smoothing / dt / 2) + 1, 5) if smoothing > 0 else 3
     if len(x) < window:
         window = 3

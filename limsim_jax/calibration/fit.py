@@ -47,7 +47,7 @@ OBJECTIVES = ("gap", "speed", "mixed", "log", "relative", "absolute")
 METHODS = ("lm", "lbfgs", "adam")
 
 STANDING = 0.1
-"""m/s, who is slower stands; of a stop only the first `STANDING_TIME` s count."""
+"""m/s, a slower vehicle stands; of a stop only the first `STANDING_TIME` s count."""
 
 STANDING_TIME = 2.0
 FLOOR = 1.0
@@ -194,7 +194,7 @@ def _mean_square(r: Array, data: Data) -> Array:
 def errors(
     model: CarFollowing, parameters: Float[Array, "D P"], data: Data, dt: float
 ) -> dict[str, Float[Array, " D"]]:
-    """All objectives of each driver, and whether it ran into its leader (`collision`, 1 or 0)."""
+    """All objectives of each driver, and `collision` (1 or 0)."""
 
     def one(p: Array, data: Data) -> dict[str, Array]:
         gap, v = rollout(model, p, data, dt)
@@ -237,7 +237,7 @@ class Prior(NamedTuple):
 
 
 def _residuals(problem: Problem, u: Array, data: Data, prior: Prior | None) -> Array:
-    """Residuals whose sum of squares is the mean square error, plus what the prior adds."""
+    """Residuals whose sum of squares is the cost."""
     p = boxed(u)
     gap, v = rollout(problem.model, p, data, problem.dt)
     r = residuals(problem.objective, gap, v, data) / jnp.sqrt(jnp.maximum(jnp.sum(data.weight), 1))
@@ -248,7 +248,14 @@ def _residuals(problem: Problem, u: Array, data: Data, prior: Prior | None) -> A
 
 
 def cost(problem: Problem, u: Array, data: Data, prior: Prior | None = None) -> Array:
-    """Mean square of the objective of one driver at a point `[P]` of the unit box, plus what a prior adds."""
+    """Mean square error of one driver, plus what a prior adds.
+
+    Args:
+      problem: model and objective.
+      u: point `[P]` of the unit box.
+      data: of one driver.
+      prior: of its parameters, or None.
+    """
     r = _residuals(problem, u, data, prior)
     return _finite(jnp.sum(r * r))
 
@@ -287,7 +294,7 @@ class _Descent(NamedTuple):
 def _levenberg_marquardt(
     problem: Problem, u: Array, data: Data, prior: Prior | None, iterations: int, tolerance: float
 ) -> tuple[Array, Array]:
-    """Points `[D, S, P]` and costs `[D, S]` that each start comes to; several dampings are tried at once."""
+    """Points `[D, S, P]` and costs `[D, S]` of all starts; several dampings at once."""
 
     def normal(u: Array, data: Data, prior: Prior | None) -> tuple[Array, Array, Array]:
         return _normal_equations(problem, u, data, prior)
@@ -348,7 +355,7 @@ def _screen(problem: Problem, u: Array, data: Data) -> Array:
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _loss(problem: Problem, theta: Array, data: Data) -> Array:
-    """Logarithm of the error at p = lo + (hi - lo) sigmoid(theta); its gradient is by forward mode."""
+    """Logarithm of the error at a `theta`; its gradient is by forward mode."""
     return 0.5 * jnp.log(cost(problem, jax.nn.sigmoid(theta), data) + 1e-8)
 
 
@@ -489,7 +496,7 @@ def solve(
     iterations: int | None,
     seed: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points of the unit box `[D, S, P]` and mean squares `[D, S]` of all descents."""
+    """Points of the unit box `[D, S, P]` and costs `[D, S]`."""
     data = jax.tree.map(jnp.asarray, data)
     count, size = data.gap.shape[0], len(PARAMETERS)
     starts = (8 if isinstance(problem.model, IDM) else 16) if starts is None else starts
@@ -524,7 +531,7 @@ def solve(
 def refine(
     problem: Problem, data: Data, parameters: NDArray[Any], prior: Prior, iterations: int = 25
 ) -> NDArray[np.float64]:
-    """Parameters `[D, P]` of greatest posterior density near the given ones, with a prior for each driver."""
+    """Parameters `[D, P]` of greatest posterior density near the given ones."""
     u = jnp.asarray(unboxed(parameters), jnp.float32)[:, None]
     prior = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), prior)
     u, _ = _levenberg_marquardt(problem, u, jax.tree.map(jnp.asarray, data), prior, iterations, 1e-5)

@@ -2,7 +2,7 @@
 
 `match` makes the distance of named statistics from their targets least with CMA-ES (Hansen 2016, arXiv
 1604.00772), a batch of candidates at a time. `Engine` is such a simulation: factors on the medians of a
-population's parameters in, saturation flow, lane-change rate and whatever else a measure finds out. All
+population's parameters in, saturation flow, lane-change rate and other results of a measure. All
 candidates see the same seeds (common random numbers), so their differences are not those of the draws; and
 the factors are arrays, so that there is one compiled program.
 """
@@ -172,7 +172,7 @@ def match(
 
 
 def scaled(population: Population, names: Sequence[str], factors: Float[Array, " P"]) -> Population:
-    """The population with the medians and bounds of some parameters multiplied, of all its types.
+    """The population with medians and bounds of some parameters multiplied.
 
     The spread of a log-normal parameter is relative and stays; that of a normal one is multiplied as well.
 
@@ -253,7 +253,7 @@ class Engine:
     Attributes:
       run: with a `measure`.
       lane_map: where.
-      demand: who drives; its population is what the factors multiply.
+      demand: of vehicles; the factors multiply its population.
       slots: of vehicles.
       names: parameters of the population that have a factor.
     """
@@ -276,7 +276,7 @@ class Engine:
         return jax.jit(jax.vmap(over_seeds, in_axes=(0, None, None, None)))
 
     def measure(self, factors: Floats, seeds: Sequence[int]) -> dict[str, Floats]:
-        """What the measure finds in every world, `[M S]`, of candidates `[M P]`; NaN: nothing."""
+        """Measured values of candidates `[M P]` in every world, `[M S]`; NaN: none."""
         found = self._worlds(
             jnp.asarray(factors, jnp.float32), jnp.asarray(seeds, jnp.int32), self.lane_map, self.demand
         )
@@ -299,7 +299,7 @@ def write_scaled(
     classes: Sequence[str] = ("car",),
     sources: Sequence[str] = (),
 ) -> None:
-    """A population with the medians of some parameters multiplied, as a file for scenarios.
+    """Write a population with the medians of some parameters multiplied.
 
     Args:
       factors: by parameter.

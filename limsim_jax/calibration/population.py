@@ -1,4 +1,4 @@
-"""From fits of single drivers to a population: who else may be on the road, and how sure that is.
+"""From fits of single drivers to the population that they come from.
 
 Log-parameters of drivers are taken for draws of one normal distribution with full covariance. Its mean and
 covariance maximise the marginal likelihood (EM; Dempster, Laird, Rubin 1977), with what the data of each
@@ -207,9 +207,9 @@ def _prior(mean: Floats, covariance: Floats, found: Uncertainty, data: Data) -> 
 def _expectation_maximisation(
     information: Floats, pull: Floats, iterations: int = 300
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Mean, covariance, posterior means `[D P]` and covariances of drivers with Gaussian likelihoods.
+    """Mean and covariance; posterior means `[D P]` and covariances of the drivers.
 
-    A driver's log-likelihood is `-x^T information x / 2 + pull^T x`.
+    A driver's log-likelihood is Gaussian: `-x^T information x / 2 + pull^T x`.
     """
     low, high = np.log(LOWER), np.log(UPPER)
     centre = (low + high) / 2
@@ -282,7 +282,7 @@ def predictive_check(
     Args:
       law: from other segments than these.
       segments: to predict.
-      known: the drivers are those of the law: draw from their posteriors, else new drivers are drawn.
+      known: the drivers are those of the law: draw from their posteriors; otherwise new drivers are drawn.
       draws: per driver, each with a residual acceleration of its own.
       seed: of the draws.
 
@@ -314,7 +314,7 @@ def predictive_check(
         )
     )
     counts = np.asarray(data.weight) > 0
-    # Just after the start everybody is where the recording was.
+    # Just after the start all vehicles are where the recording was.
     since = _since(np.asarray(data.start))
     counts &= since * dt > 5.0
     found: dict[str, float] = {}

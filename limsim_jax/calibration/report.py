@@ -167,7 +167,7 @@ def _errors(found: Fit, parts: Sequence[Segment], samples: int = 0) -> dict[str,
 
 
 def _of_others(whole: Fit) -> Floats:
-    """For each driver the median parameters of that half of the drivers which it is not of."""
+    """Median parameters of the half of the drivers without this driver."""
     parameters = whole.parameters.copy()
     even = np.arange(len(parameters)) % 2 == 0
     for half in (even, ~even):

@@ -303,7 +303,7 @@ def _summary(values: Floats) -> dict[str, float]:
 
 
 def _lines(table: _Table) -> list[str]:
-    """Columns under one another, the first and a last one without a name to the left."""
+    """Lines of a table; the first column and one without a name stand left."""
     columns = [[head, *cells] for head, cells in zip(table.head, zip(*table.rows, strict=True), strict=True)]
     wide = [max(map(len, column)) for column in columns]
 

@@ -56,7 +56,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Uncertainty:
-    """Per driver `D`, under the wide prior of the module but for `information`."""
+    """Per driver `D`; all but `information` under the wide prior."""
 
     drivers: tuple[str, ...]
     standard_error: Floats  # [D P], in units of the parameters
@@ -71,7 +71,16 @@ class Uncertainty:
 
 
 def uncertainty(fit: Fit, segments: Sequence[Segment], *, samples: int = 0) -> Uncertainty:
-    """Standard errors of a fit, from the segments that it was made of."""
+    """Standard errors of a fit.
+
+    Args:
+      fit: of the drivers.
+      segments: those of the fit.
+      samples: see `fit.stack`.
+
+    Raises:
+      ValueError: other drivers than those of the fit.
+    """
     drivers, data, dt = stack(segments, samples)
     if drivers != fit.drivers:
         raise ValueError("these are not the segments of the fit: other drivers")

@@ -142,7 +142,7 @@ def train(
     out: Annotated[Path, typer.Option(help="Write the weights here.")] = Path("pdm_hybrid.npz"),
     seeds: Annotated[int, typer.Option(help="Worlds of each scenario to learn from.")] = 48,
     epochs: Annotated[int, typer.Option(help="Passes through the data.")] = 60,
-    policy: Annotated[str, typer.Option(help="Who drives in the worlds to learn from.")] = "like_traffic",
+    policy: Annotated[str, typer.Option(help="Drives in the worlds to learn from.")] = "like_traffic",
 ) -> None:
     """Train a policy's network on rollouts of the bundled scenarios."""
     del what  # there is one

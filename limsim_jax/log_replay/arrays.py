@@ -1,4 +1,4 @@
-"""A recorded scene as arrays: the log, every vehicle's path through the plane, and how paths lie to others.
+"""A recorded scene as arrays: the log, and how paths lie to each other.
 
 A vehicle that is taken over keeps to the path of its own log and only shifts in time, so it is one number,
 metres along its path. Where every path lies seen from every other one does not depend on what happens: it
@@ -95,7 +95,7 @@ def build_arrays(recorded: Tracks, lane_map: LaneMap) -> SceneArrays:
     first, last = valid.argmax(0), count - 1 - valid[::-1].argmax(0)
     for k in np.flatnonzero(first == last)[:1]:
         raise ValueError(
-            f"{recorded.source}: vehicle {recorded.vehicles[k]}: one entry; at least two would be right"
+            f"{recorded.source}: vehicle {recorded.vehicles[k]}: one entry; at least two are expected"
         )
     x, y = relative(lane_map, np.nan_to_num(recorded.x), np.nan_to_num(recorded.y))
     x, y = x.astype(float), y.astype(float)
@@ -115,7 +115,7 @@ def build_arrays(recorded: Tracks, lane_map: LaneMap) -> SceneArrays:
     if 4 * size * number**2 > _MOST_PAIRS:
         raise ValueError(
             f"{recorded.source}: {number} vehicles on paths of up to {p[-1].max():.0f} m; a shorter period "
-            f"or fewer vehicles, up to {math.sqrt(_MOST_PAIRS / 4 / size):.0f} of them, would be right"
+            f"or fewer vehicles, up to {math.sqrt(_MOST_PAIRS / 4 / size):.0f} of them, are expected"
         )
     rows = _Onward(recorded.network, lane_map)
     path = np.zeros((number, size, 4))
@@ -160,7 +160,12 @@ def build_arrays(recorded: Tracks, lane_map: LaneMap) -> SceneArrays:
 
 
 def pose(scene: SceneArrays, p: Float[Array, " N"]) -> Float[Array, "N 4"]:
-    """x, y (m), heading (rad) and recorded speed (m/s) of every vehicle at `p` m along its own path."""
+    """x, y (m), heading (rad) and recorded speed (m/s) along the paths.
+
+    Args:
+      scene: what was recorded.
+      p: m along its own path, of every vehicle.
+    """
     row = jnp.arange(p.shape[0])
     k, u = _cell(scene, p)
     return scene.path[row, k] * (1 - u)[:, None] + scene.path[row, k + 1] * u[:, None]
@@ -176,7 +181,7 @@ class Sight(NamedTuple):
 
 
 def sight(scene: SceneArrays, p: Float[Array, " N"]) -> Sight:
-    """Where everybody is seen from the paths of all, at `p` m along their own."""
+    """All vehicles, `p` m along their own paths, seen from all paths."""
     place = jnp.clip(p / GRID, 0, scene.path.shape[1] - 1)
     k = jnp.round(place)
     # straight on from the nearest point; in a bend of radius R that is off by half a metre times d / R
@@ -203,7 +208,7 @@ def sight_of(
 
 
 def separation(length: Any, width: Any, dx: Any, dy: Any, angle: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Gaps along and across every body i to every body j, `[i, j]`, m; of NumPy arrays or of JAX's.
+    """Gaps along and across bodies i to j, `[i, j]`, m; of NumPy arrays or of JAX's.
 
     They are apart if one of the gaps is positive; not if none is in the frames of both (separating axes).
 
@@ -249,7 +254,13 @@ class _Onward:
         self.origin = np.asarray(lane_map.origin, float)
 
     def walk(self, end: Floats, row: int, s: float, d: float) -> tuple[Floats, float]:
-        """Points `GRID` m apart after the `end` (x, y, heading, v), and m until the road ends."""
+        """Points `GRID` m apart after the `end`, and m of road left.
+
+        Args:
+          end: x, y, heading, v.
+          row: lane of the end.
+          s, d: m, place on that lane.
+        """
         count = int(ONWARD / GRID)
         points = []
         lane = self.network.lanes[self.ids[row]] if row != NO_LANE else None
@@ -306,7 +317,7 @@ def _seen(path: Floats) -> Floats:
 
 
 def _edge(p: Floats, valid: NDArray[np.bool_], seen: Floats) -> Floats:
-    """How far along every path anything was recorded, on it or beside it, m."""
+    """End of the record on and beside each path, m along it."""
     number = p.shape[1]
     far = p[-1].copy()
     k = np.round(p / GRID).astype(int)
@@ -329,9 +340,9 @@ def _clearance(pose: Floats, length: Floats, width: Floats, valid: NDArray[np.bo
 def _drivers(
     recorded: Tracks, p: Floats, v: Floats, valid: NDArray[np.bool_], seen: Floats
 ) -> tuple[Driver, Floats]:
-    """Drivers that keep shorter gaps than the vehicle kept in the log, and their desired speeds.
+    """Drivers with shorter gaps than those in the log, and desired speeds.
 
-    Others could never come back to the places of their logs.
+    With longer gaps they could never come back to the places of their logs.
     """
     count, number = v.shape
     gap = np.full((count, number), np.inf)

@@ -1,4 +1,4 @@
-"""Policies of the package at the wheel of an ego in a log: bicycle model, trajectories, controls."""
+"""A policy at the wheel of an ego in a log: a bicycle model."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ class PolicyPilot:
     def __post_init__(self) -> None:
         """Refuse policies that cannot drive here."""
         if not self.policy.free:
-            raise ValueError("policy: one that keeps to lanes; one that moves in the plane would be right")
+            raise ValueError("policy: it keeps to lanes; one that moves egos in the plane is expected")
         if self.policy.others:
-            raise ValueError("policy: one that drives others beside the ego; in a log there is the ego alone")
+            raise ValueError("policy: it drives other vehicles; one that drives the ego alone is expected")
 
     def init(self, scene: SceneArrays, ego: Ego) -> Flight:
         """On the log."""
@@ -63,7 +63,7 @@ class PolicyPilot:
         shapes = jax.eval_shape(self.policy, config, self.lane_map, state, memory, jax.random.key(0))
         command = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes[0])
         if command.trajectory is None and command.control is None:
-            raise ValueError("policy: gives neither trajectories nor controls; one of them would be right")
+            raise ValueError("policy: returns neither trajectories nor controls; one of them is expected")
         alone = _alone(state, ego.slot)
         return Flight(
             flying=jnp.zeros((), bool), x=zero, y=zero, heading=zero, v=zero, a=zero,

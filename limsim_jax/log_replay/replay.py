@@ -29,7 +29,7 @@ _MODES = ("log", "controlled", "return")  # by `Mode`
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """A replay of a scene, of one variant or of `B` of them.
+    """A replay of a scene: one variant, or `B` of them.
 
     Attributes:
       scene: what was recorded.
@@ -58,7 +58,7 @@ class Replay:
 
     @property
     def takeovers(self) -> pa.Table:
-        """One row per variant and vehicle that left its log without being the ego.
+        """One row per variant and vehicle that was taken over.
 
         Columns: variant; ego and vehicle (ids); takeovers; because_log_ends and handed_back (of these);
         controlled (s off the log); displacement (m, largest distance from the place in the log); delayed
@@ -143,7 +143,7 @@ class Replay:
         return pa.table({name: np.asarray(column)[active] for name, column in columns.items()})
 
     def trace(self, variant: int = 0) -> Trace:
-        """A variant as the record of steps that pictures and the viewer take, `[T, ...]`."""
+        """A variant as a record of steps, `[T, ...]`, for pictures."""
         moments, log = self._moments(variant), self.scene.arrays.log
         lanes = self.scene.map.lanes
         active = np.asarray(moments.active)
@@ -159,20 +159,21 @@ class Replay:
         ego = int(self.ego[variant])
         driven = np.where(self.told[variant] & active[:, ego], ego, -1)
         nothing = np.zeros(active.shape, np.int32)
-        return Trace(
-            time=np.arange(count, dtype=np.float32) * np.float32(log.dt),
-            active=active,
-            vehicle=np.broadcast_to(np.arange(number, dtype=np.int32), active.shape),
-            lane=np.where(active, lane, NO_LANE),
-            s=s + size[:, 0] / 2,
-            d=d,
-            v=v,
-            a=a,
-            box=box,
-            status=nothing,
-            phase=np.zeros((count, lanes.signals.duration.shape[0]), np.int32),
-            driven=driven[:, None].astype(np.int32),
-        )  # pyright: ignore[reportArgumentType]
+        columns: dict[str, Any] = {
+            "time": np.arange(count, dtype=np.float32) * np.float32(log.dt),
+            "active": active,
+            "vehicle": np.broadcast_to(np.arange(number, dtype=np.int32), active.shape),
+            "lane": np.where(active, lane, NO_LANE),
+            "s": s + size[:, 0] / 2,
+            "d": d,
+            "v": v,
+            "a": a,
+            "box": box,
+            "status": nothing,
+            "phase": np.zeros((count, lanes.signals.duration.shape[0]), np.int32),
+            "driven": driven[:, None].astype(np.int32),
+        }
+        return Trace(**columns)
 
     def _moments(self, variant: int) -> Moment:
         if not 0 <= variant < len(self):

@@ -80,7 +80,7 @@ class Scene:
         ego: int | str | Sequence[int | str],
         *,
         policy: Policy | None = None,
-        braking: ArrayLike | None = None,
+        braking: ArrayLike | Sequence[float] | None = None,
         start: float | None = None,
         duration: float | None = None,
         takeover: Takeover | None = None,
@@ -109,8 +109,8 @@ class Scene:
         """
         if policy is not None and braking is not None:
             raise ValueError("policy and braking: one of them is expected")
-        several = isinstance(ego, Sequence) and not isinstance(ego, str)
-        slots = np.array([self._slot(one) for one in (ego if several else [ego])])
+        chosen = [ego] if isinstance(ego, (str, int, np.integer)) else list(ego)
+        slots = np.array([self._slot(one) for one in chosen])
         rates = np.atleast_1d(np.asarray(0.0 if braking is None else braking, float))
         if len(slots) > 1 and rates.size > 1 and len(slots) != rates.size:
             raise ValueError(f"{len(slots)} egos and {rates.size} values of braking; as many are expected")

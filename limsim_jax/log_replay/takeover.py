@@ -1,18 +1,20 @@
-"""Replay of a scene in which the traffic model takes vehicles over whose log an ego has made impossible.
+"""Replay of a scene with an ego: the traffic model takes over where a log has become impossible.
 
 Every vehicle is on its LOG, under control (CTRL) of a car-following model, or on its RETURN to the log:
 
-- LOG to CTRL: the predicted way of a vehicle that has left its log (an ego, or one under control) meets the
-  logged way within `horizon`, where the log had more room; or that vehicle is the leader, and the logged
-  motion would reach it within `ttc` or ask the IDM for braking above `braking`; or the log ends amid the
-  road near the ego. Followers of those taken over are looked at again in the same step.
+- LOG to CTRL, for one of three reasons. The predicted path of a vehicle off its log (an ego, or one under
+  control) meets the logged path within `horizon`, where the log had more room. Or that vehicle is the leader,
+  and the logged motion would reach it within `ttc`, or make the IDM brake harder than `braking`. Or the log
+  ends in the middle of the road near the ego. Followers of a vehicle that is taken over are checked again in
+  the same step.
 - CTRL: along the path of the own log, with the lane changes in it, by car following.
-- CTRL to RETURN, after `clear` s without any of this: along the path at the speed that the log had there,
-  and faster or slower to be where the log is, but never faster than car following allows.
-- RETURN to LOG: where the log is, within `place` and `speed`, for `settle` s. What is left fades away.
+- CTRL to RETURN, after `clear` s without any of these reasons: along the path at the speed of the log, faster
+  or slower to catch up with its place there, but never faster than car following allows.
+- RETURN to LOG: at the place in the log, within `place` and `speed`, for `settle` s. The rest fades away.
 
-Each takeover and each return fades over `fade` s, so nobody jumps. Who is not back within `patience` stays
-under control. Who would enter where somebody is who is not in the log waits outside.
+Each takeover and each return fades over `fade` s, so positions stay continuous. A vehicle that is not back
+within `patience` stays under control. A vehicle that would enter where another one is off its log waits
+outside.
 """
 
 from __future__ import annotations
@@ -40,15 +42,15 @@ _TRACK = 0.5  # s, time constant of the speed on the return
 _ASTRAY = 0.5  # m and m/s from its log up to which an ego in the plane counts as on it
 _TOUCH = 0.1  # m, least gap that is told from contact
 _AHEAD = (1.0, 2.0)  # s ahead at which others may have come in the way
-_YIELDING = 3.0  # m/s^2, hardest braking for those who are not in the way yet
-_FREE = 1e3  # m/s^2, nobody to mind
+_YIELDING = 3.0  # m/s^2, hardest braking for vehicles that are not in the way yet
+_FREE = 1e3  # m/s^2, without any vehicle ahead
 _ROOM = 2.0  # m that an arrival needs, and ...
 _HEADWAY = 0.3  # ... s of its follower's way, and ...
 _BRAKING = 2.0  # ... m/s^2 that it may ask of the follower
 
 
 class Mode(enum.IntEnum):
-    """Who moves a vehicle."""
+    """What moves a vehicle."""
 
     LOG = 0
     CTRL = 1
@@ -65,7 +67,7 @@ class Takeover:
     room: float = 0.3  # ... m around them
     ttc: float = 2.5  # s
     braking: float = 3.0  # m/s^2
-    keep: float = 50.0  # m from an ego that has left its log, within which nobody vanishes as its log ends
+    keep: float = 50.0  # m from an ego that has left its log, within which vehicles stay when their logs end
     clear: float = 2.0  # s
     behind: float = 30.0  # m from the place in the log within which a return may begin
     gain: float = 0.5  # 1/s, speed per metre from the place in the log ...
@@ -84,19 +86,19 @@ class Takeover:
 
 @struct.dataclass(frozen=True, kw_only=True)
 class Ego:
-    """A recorded vehicle that does what it is told to, at moments at which it is told something.
+    """A recorded vehicle that is told what to do at some moments.
 
-    Before, it is on its log; after, it returns there by the same rules as the others.
+    Before these it is on its log; after them it returns there by the same rules as the others.
     """
 
-    slot: Int[Array, ""]  # -1: nobody
+    slot: Int[Array, ""]  # -1: none
     told: Bool[Array, " T"]
     acceleration: Float[Array, " T"]  # m/s^2, along the path of its log
 
 
 @struct.dataclass(frozen=True, kw_only=True)
 class Record:
-    """What has become of every vehicle; the ego itself is not counted among the takeovers."""
+    """Counts of every vehicle; the ego itself is not among the takeovers."""
 
     takeovers: Int[Array, " N"]
     ended: Int[Array, " N"]  # of these, because the log ended
@@ -113,7 +115,7 @@ class Record:
 
 
 class Moment(NamedTuple):
-    """Everybody at one moment."""
+    """All vehicles at one moment."""
 
     x: Float[Array, " N"]  # m, middle of the body
     y: Float[Array, " N"]
@@ -154,7 +156,7 @@ class Flight(NamedTuple):
 
 
 class Pilot(Protocol):
-    """Drives an ego in the plane, from the first moment at which it is told something on."""
+    """Drives an ego in the plane, from the first told moment on."""
 
     def init(self, scene: SceneArrays, ego: Ego) -> Flight:
         """Before the first moment."""
@@ -170,7 +172,17 @@ class Pilot(Protocol):
         t: Int[Array, ""],
         key: Key[Array, ""] | None,
     ) -> Flight:
-        """From moment `t`, which is `moment` with accelerations `a` (m/s^2), to the next."""
+        """The flight from one moment to the next.
+
+        Args:
+          scene: what was recorded.
+          ego: which is in the air.
+          flight: at moment `t`.
+          moment: of all vehicles.
+          a: m/s^2, their accelerations.
+          t: number of the moment.
+          key: randomness, or None.
+        """
         ...
 
 
@@ -186,10 +198,10 @@ class _Events(NamedTuple):
 
 
 class _Lead(NamedTuple):
-    """Who is next on the own path."""
+    """The next vehicle on the own path."""
 
     who: Int[Array, " N"]
-    gap: Float[Array, " N"]  # m, `NO_GAP` if there is nobody
+    gap: Float[Array, " N"]  # m, `NO_GAP` without a leader
     v: Float[Array, " N"]  # m/s, along the own path
     a: Float[Array, " N"]
 
@@ -207,7 +219,7 @@ def replay(
 
     Args:
       scene: what was recorded.
-      ego: who does something else there.
+      ego: the vehicle that deviates from its log.
       options: of the takeover.
       pilot: drives the ego in the plane while it is told to; its accelerations then mean nothing.
       key: randomness of the pilot.
@@ -252,7 +264,7 @@ def replay_many(
     keys: Key[Array, " B"] | None = None,
     at_once: int = 64,
 ) -> Record:
-    """Replay a scene with each of many egos, `[B, ...]`, in one program.
+    """Replay a scene with each of many egos, `[B, ...]`.
 
     `at_once` of them go side by side, for the tables of pairs of more worlds do not fit into caches.
     """
@@ -266,7 +278,7 @@ def replay_many(
 def _step(
     scene: SceneArrays, ego: Ego, options: Takeover, going: _Going, flight: Flight | None, t: Int[Array, ""]
 ) -> tuple[_Going, Moment, _Events]:
-    """Everybody at moment `t`, and how they go on to the next."""
+    """All vehicles at moment `t`, and their motion to the next."""
     log = scene.log
     count, number = log.x.shape
     me = jnp.arange(number)
@@ -283,7 +295,7 @@ def _step(
     if flight is not None:
         p, v, a, seen = _fly(scene, flight, flies, p, v, a, seen)
 
-    # where everybody is
+    # places
     own = pose(scene, p)
     base = jnp.where(on_log[:, None], logged, own[:, :3])
     place = jnp.where((fade > 0)[:, None], base + fade[:, None] * going.rest, base)
@@ -291,7 +303,7 @@ def _step(
         place = jnp.where(flies[:, None], jnp.stack([flight.x, flight.y, flight.heading])[None, :], place)
         on_log &= ~flies
 
-    # who goes, who comes
+    # departures and arrivals
     gone = jnp.where(on_log, t > scene.last, p > scene.limit) & going.active
     here = going.active & ~gone
     minded = jnp.broadcast_to(here[:, None], (number, number))
@@ -306,10 +318,10 @@ def _step(
     mode = jnp.where(on_log, Mode.LOG, jnp.where(waiting, Mode.CTRL, going.mode)).astype(going.mode.dtype)
     moment = Moment(place[:, 0], place[:, 1], place[:, 2], v, mode, active)
 
-    # who has to leave its log
+    # which vehicles have to leave their logs
     told = ((mine & ego.told[t]) | flies) & active
     off_log = active & (~on_log | told)
-    if flight is not None:  # who flies where its log is does not disturb anybody
+    if flight is not None:  # an ego in the plane that is where its log is disturbs no vehicle
         error = place[:, :2] - logged[:, :2]
         astray = (jnp.abs(error) > _ASTRAY).any(-1) | (jnp.abs(v - log.v[t]) > _ASTRAY) | ~log.valid[t]
         off_log &= ~mine | astray
@@ -330,7 +342,7 @@ def _step(
     for _ in range(1 + _CHAIN):
         taken |= could & urgent & (off_log | taken)[lead.who]
 
-    # who may come back
+    # which vehicles may come back
     off = jnp.where(taken | late | (told & on_log), 0.0, going.off)
     clear = jnp.where(urgent | meets | taken | told, 0.0, going.clear + log.dt)
     may = log.valid[t] & ~told & (off <= options.patience) & active
@@ -356,7 +368,7 @@ def _step(
     follow = options.model(scene.driver, gap=lead.gap, v=v, v_lead=lead.v, a_lead=lead.a, v0=v0)
     follow = jnp.minimum(follow, _yield(scene, options, seen, active, p, v, a, v0))
     track = jnp.clip((wish - v) / _TRACK, -scene.driver.b, scene.driver.a)
-    # nobody runs ahead of its log either
+    # no vehicle runs ahead of its log either
     wanted = jnp.where(returns | (behind < 0), jnp.minimum(track, follow), follow)
     wanted = jnp.where(told, ego.acceleration[t], wanted)
     v_next, way = ballistic(v, wanted, log.dt)
@@ -418,7 +430,10 @@ def _yield(
     a: Array,
     v0: Array,
 ) -> Float[Array, " N"]:
-    """Acceleration behind those who will be in the way: they change lanes, or the own path does; m/s^2."""
+    """Acceleration behind vehicles that will be in the way, m/s^2.
+
+    They change lanes, or the own path does.
+    """
     _, ahead, in_way = _gaps(scene, seen, p)
     minded = active[:, None] & ~(ahead & in_way)
     wish = jnp.full_like(v, _FREE)
@@ -453,7 +468,10 @@ def _enter(
     due: Array,
     waiting: Array,
 ) -> Bool[Array, " N"]:
-    """Who enters now: those who are `due` and have room to all off their log, and those `waiting` to all."""
+    """Which vehicles enter now.
+
+    Those that are `due` need room to all that are off their logs, those that are `waiting` to all.
+    """
     gap, ahead, in_way = _gaps(scene, seen, p)
     follower, leader = v[None, :], v[:, None]
     closing = jnp.maximum(follower - leader, 0)
@@ -480,7 +498,10 @@ def _meets(
     v: Array,
     a: Array,
 ) -> Bool[Array, " N"]:
-    """Whose logged way meets the predicted way of another one that is off its log and ahead of it."""
+    """Which logged paths meet a predicted path.
+
+    That is the path of another vehicle, off its log and ahead.
+    """
     log, count = scene.log, scene.log.x.shape[0]
     found = jnp.zeros((p.shape[0], p.shape[0]), bool)
     for k in range(1, round(options.horizon / _GRID) + 1):
@@ -534,7 +555,7 @@ def _count(
     place = (moment.x, moment.y, moment.heading)
     gap, beside, _ = _bodies(scene, place, place)
     apart = (gap > 0) | (beside > 0)
-    # who is on its log, and not fading, is where it was recorded
+    # a vehicle on its log, and not fading, is where it was recorded
     strays = off_log | (moment.active & (before.switched < options.fade))
     jump = jnp.where(strays & (was > 0), moved - dt * jnp.maximum(moment.v, v), 0)
     struck = ~(apart | apart.T) & moment.active[:, None] & moment.active[None, :]
@@ -559,7 +580,7 @@ def _count(
 
 
 def as_logged(scene: SceneArrays, slot: int | Int[Array, ""] = -1) -> Ego:
-    """An ego that does what it did; -1: nobody is the ego."""
+    """An ego that does what it did; -1: no ego."""
     count = scene.log.x.shape[0]
     return Ego(
         slot=jnp.asarray(slot, jnp.int32),
@@ -575,7 +596,15 @@ def braking(
     deceleration: float | Float[Array, ""],
     duration: float | Float[Array, ""] = 1e6,
 ) -> Ego:
-    """An ego that brakes at `start` s by `deceleration` m/s^2 for `duration` s, then returns to its log."""
+    """An ego that brakes for a while, then returns to its log.
+
+    Args:
+      scene: what was recorded.
+      slot: number of the ego.
+      start: s, when it begins to brake.
+      deceleration: m/s^2.
+      duration: s.
+    """
     count = scene.log.x.shape[0]
     time = jnp.arange(count, dtype=jnp.float32) * scene.log.dt
     told = (time >= start - 1e-4) & (time < start + duration - 1e-4)

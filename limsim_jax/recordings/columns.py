@@ -109,7 +109,7 @@ def read_columns(
 
 
 def has_fields(columns: list[str]) -> bool:
-    """Whether columns are named like the fields, so that nothing need be said of them."""
+    """Whether columns are named like the fields that are needed."""
     known = {name.lower() for name in columns}
     return "time" in known and any(need <= known for need in _NEEDS)
 
@@ -157,7 +157,7 @@ def _fields(table: Table, columns: dict[str, str]) -> dict[str, str]:
 
 
 def example(columns: list[str]) -> str:
-    """How to say which column is what, with the columns of a file."""
+    """How to say which column of a file is what."""
     fields = dict(zip(("time", "x_lead", "x"), [*columns, "?", "?", "?"], strict=False))
     text = ",".join(f"{field}={column}" for field, column in fields.items())
     return f'say which is what, as in --columns "{text}" --length 4.5 (Python: columns={fields}, length=4.5)'
@@ -167,7 +167,7 @@ def _scales(source: str, units: dict[str, str]) -> dict[str, float]:
     for field, same in (("x_lead", "x"), ("v_lead", "v")):
         if same in units:
             units.setdefault(field, units[same])
-    scale = dict.fromkeys(FIELDS, 1.0)
+    scale: dict[str, float] = dict.fromkeys(FIELDS, 1.0)
     for field, unit in units.items():
         if field not in FIELDS or field.startswith("id"):
             known = ", ".join(name for name in FIELDS if not name.startswith("id"))
@@ -182,7 +182,7 @@ def _scales(source: str, units: dict[str, str]) -> dict[str, float]:
 
 
 def _pairs(table: Table, names: Mapping[str, str]) -> tuple[tuple[str, ...], list[Ints]]:
-    """Names of all vehicles, and the indices of follower and leader of each row."""
+    """Names of all vehicles; follower and leader of each row."""
     count = len(table)
     follower = table.text(names["id"]) if "id" in names else np.full(count, "follower")
     if "id_lead" in names:

@@ -66,7 +66,7 @@ class CommonRoad:
 
 
 def _states(read: xml.XmlReader, obstacle: Any, kind: str) -> list[tuple[Any, ...]]:
-    """Line, id, kind, step, x, y, heading, v, length and width of every state."""
+    """Line, id, kind and the numbers of `Rows` of every state."""
     vehicle = read.text(obstacle, "id")
     size = [read.content(obstacle, f"shape/rectangle/{side}") for side in ("length", "width")]
     first = obstacle.find("initialState")

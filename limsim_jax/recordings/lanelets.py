@@ -1,4 +1,4 @@
-"""Lanelets, pieces of lane between two bounds, and the network that they make."""
+"""Lanelets: pieces of lane between two bounds, and their network."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Lanelet:
 
 
 def centre_line(lanelet: Lanelet) -> tuple[Floats, Floats]:
-    """Points in the middle between the bounds, `[K 2]`, and the width there, `[K]`; m."""
+    """Points in the middle between the bounds, `[K 2]`, and widths, `[K]`; m."""
     left, right = matched_bounds(lanelet.left_bound, lanelet.right_bound)
     return (left + right) / 2, np.linalg.norm(left - right, axis=-1)
 
@@ -63,7 +63,7 @@ def matched_bounds(left: Floats, right: Floats) -> tuple[Floats, Floats]:
 def lanelet_network(
     lanelets: Sequence[Lanelet], name: str, source: str, file_hash: str = "", speed_limit: float = SPEED_LIMIT
 ) -> Network:
-    """A network whose lanes run in the middle between the bounds of lanelets.
+    """A network with the middle lines of lanelets as lanes.
 
     Lanelets that are neighbours make a road; links to lanelets that are not there are dropped and reported.
     Lane changes are allowed wherever a neighbour drives the same way: recordings tell no markings.

@@ -202,7 +202,10 @@ def leaders_on_lanelets(
 
 
 def _chains(source: str, lanelets: Sequence[Lanelet]) -> _Chains:
-    """Chains of lanelets, each continued by the first successor that is in no chain yet; points 1 m apart."""
+    """Chains of lanelets, in points 1 m apart.
+
+    Each is continued by the first successor that is in no chain yet.
+    """
     if not lanelets:
         raise RecordingError(f"{source}: no <lanelet>; a map of the lanes is expected")
     lines = {lanelet.id: centre_line(lanelet) for lanelet in lanelets}

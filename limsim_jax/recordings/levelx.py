@@ -24,7 +24,7 @@ class Meta:
     speed_limit: float  # m/s, NaN: none
 
     def per_track(self, table: Table, ident: Ints, column: str) -> NDArray[np.str_]:
-        """A column of the tracks for each row with these ids, in small letters.
+        """A column of the tracks' meta file, per row, in small letters.
 
         Raises:
           RecordingError: a track is not in the meta file.

@@ -109,7 +109,7 @@ def _classes(table: Table) -> Ints:
 
 
 def _periods(ident: Floats, time: Floats, limit: float) -> Ints:
-    """How often an id has vanished for longer than `limit` seconds before, per row."""
+    """How often each id was gone for over `limit` s before."""
     order = np.lexsort((time, ident))
     new = np.diff(ident[order], prepend=np.nan) != 0
     again = ~new & (np.diff(time[order], prepend=time[order][:1]) > limit)

@@ -188,7 +188,7 @@ def read_platoon(
 
 
 def _lane(first: Floats, last: Floats) -> Lanelet:
-    """The lane along the way of the last car and on along that of the first, `[T 2]` each."""
+    """The lane along the last car, then the first, `[T 2]` each."""
     onward = int(np.argmin(np.linalg.norm(first - last[-1], axis=-1)))
     line = np.concatenate([last, first[onward + 1 :]])
     line = line[np.append(True, _forward(line))]
@@ -208,7 +208,7 @@ def _course(x: Floats, y: Floats) -> Floats:
 
 
 def _forward(line: Floats) -> NDArray[np.bool_]:
-    """Which points of a way are at least `SAMPLE` m after the last one taken."""
+    """Points of a way that are `SAMPLE` m apart at least."""
     taken = np.zeros(len(line) - 1, bool)
     at = line[0]
     for k, point in enumerate(line[1:]):

@@ -47,12 +47,12 @@ class RecordingError(ValueError):
 
 @dataclass(frozen=True)
 class Defect:
-    """What is wrong with a recording at one place, and how many rows it concerns."""
+    """A flaw of a recording at one place."""
 
     kind: str  # "time", "overlap", "behind", "spacing"
     vehicle: str
     line: int  # of the file, the header being line 1
-    rows: int
+    rows: int  # that it concerns
     message: str
 
 

@@ -33,7 +33,7 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def header_of(data: bytes, line: int = 0) -> list[str]:
-    """Names of the columns in a line of a file, counted from 0."""
+    """Names of the columns in a line, counted from 0."""
     head = data.split(b"\n", line + 1)[line] if data.count(b"\n") >= line else b""
     text = head.decode("utf-8", "replace").lstrip("\ufeff").rstrip("\r")
     return [name.strip().strip('"') for name in text.split(",")]
@@ -164,7 +164,7 @@ def _no_rows(path: str | Path, header: int) -> RecordingError:
 
 
 def numbered(*columns: NDArray[np.str_]) -> tuple[tuple[str, ...], list[Ints]]:
-    """All names in the columns, in order, and the index of each value."""
+    """All names in the columns, sorted, and the index of each value."""
     names, index = np.unique(np.concatenate(columns), return_inverse=True)
     parts = np.split(index.astype(np.int64), len(columns))
     return tuple(names.tolist()), parts

@@ -1,4 +1,4 @@
-"""Recorded vehicles in the plane on a common clock, with the lanes that they drive on.
+"""Recorded vehicles in the plane on a common clock, with their lanes.
 
 Positions are those of the middle of the body. Nothing is repaired: what cannot be replayed is refused.
 """
@@ -56,7 +56,7 @@ class Rows:
     width: Floats  # m
 
     def where(self, rows: NDArray[np.bool_] | Ints) -> Rows:
-        """Some of the rows, in the order of `rows` if these are numbers."""
+        """Some of the rows: a mask, or their numbers in order."""
         return Rows(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 

@@ -98,7 +98,7 @@ def test_links_followers_to_simulated_leaders():
     assert np.flatnonzero(chains.fresh[0, :, c]).tolist() == [0, 60]
     assert np.flatnonzero(chains.follows[0, :, d]).tolist() == list(range(30, 80))
     assert chains.length_lead[0, 59, c] == 4.5 and chains.length_lead[0, 60, c] == 7.0
-    # once a second, from a second after somebody was put on the road
+    # once a second, from a second after the vehicle was put on the road
     assert np.flatnonzero(linked.counts[0, :, d]).tolist() == [40, 50, 60, 70]
 
 
@@ -354,7 +354,7 @@ def test_a_known_population_is_found_again(known, made, tmp_path):
     assert found.law.median["v0"] == pytest.approx(20.0, rel=0.15)
     assert found.losses[-1] < 0.5 * found.losses[0]
     assert "left of the default" in found.text() and json.dumps(found.as_json())
-    # nobody beats its own record by far, and on the periods of the fit it is no farther than on others
+    # no population beats its own record by far, and on the periods of the fit it is no farther than on others
     assert 0 < found.reachable()["headway"] < 0.5 and found.samples == known.counts.sum()
     found.write_population(tmp_path / "drivers.json", speed_limit=20.0)
     written = read_population(tmp_path / "drivers.json")

@@ -221,7 +221,7 @@ def test_other_methods_agree(method, known):
     np.testing.assert_allclose(there["v0"], here["v0"], rtol=0.01)
 
 
-def test_a_fit_does_not_depend_on_who_else_is_fitted(known):
+def test_a_fit_does_not_depend_on_the_other_drivers(known):
     _, recorded, found = known
     alone = fit(recorded[7:10], objective="gap")
     np.testing.assert_allclose(alone.error, found.error[7:10], rtol=1e-3)

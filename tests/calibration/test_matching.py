@@ -61,7 +61,7 @@ def test_saturation_flow_is_over_all_detectors_from_the_time_on_that_counts():
     assert found["saturation_flow_per_hour"] == pytest.approx(1800, rel=1e-3)  # every 2 s
     assert found["mean_speed"] == pytest.approx(10)
     assert "saturation_flow_per_hour" not in measured(TrafficFlow(), looks)
-    # nobody passes on another lane; nor do those count who passed before
+    # no vehicle passes on another lane; vehicles that passed before do not count
     assert measured(TrafficFlow(detectors=((4, 101.0),)), looks)["saturation_flow_per_hour"] is None
     late = measured(TrafficFlow(detectors=((3, 101.0),), begin=20.0), looks)
     assert late["saturation_flow_per_hour"] is None

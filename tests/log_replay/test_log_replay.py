@@ -129,7 +129,7 @@ def test_an_ego_that_brakes_is_followed_by_a_chain_of_takeovers_and_returns():
 
 
 @pytest.mark.parametrize("variant", [1, 2, 3])
-def test_nobody_touches_anybody_and_nobody_jumps(variant):
+def test_no_bodies_touch_and_positions_are_continuous(variant):
     _, _, scene = platoon()
     counts, moments = one(variants(), variant)
     assert not any(overlaps(moments, scene, t) for t in range(STEPS))
@@ -151,7 +151,7 @@ def test_contacts_are_recorded():
     assert (counts.struck == counts.struck.T).all()
 
 
-def test_who_is_not_back_in_time_stays_under_control():
+def test_a_vehicle_that_is_late_stays_under_control():
     counts, moments = one(variants(), 3)
     followers = slice(1, CARS)
     assert (moments.v[-1, followers] < 0.1).all()
@@ -164,7 +164,7 @@ def test_who_is_not_back_in_time_stays_under_control():
     assert (moments.mode[-1, followers] == Mode.CTRL).all()
 
 
-def test_who_would_enter_where_somebody_stands_waits():
+def test_a_vehicle_waits_outside_where_another_one_stands():
     _, _, scene = platoon()
     counts, moments = one(variants(), 2)
     due = round(START / DT)
@@ -249,7 +249,7 @@ def test_paths_seen_from_one_another():
         assert np.hypot(*(np.array([x, y]) + origin - ring(radius[0, k], turn))) < 0.02
         assert abs(heading - turn - np.pi / 2) < 0.02
         assert v == pytest.approx(recorded.v[0, k], abs=0.01)
-    # who is where on whose path: by angles
+    # places on each other's paths, by angles
     p = np.array([4.2, 17.7], np.float32)
     seen = sight(scene, jnp.asarray(p))
     turn = a[0] + p / radius[0]

@@ -1,4 +1,4 @@
-"""The driver population under which simulated traffic is distributed as the recorded one.
+"""Driver populations under which simulated traffic is distributed like recorded traffic.
 
 Fits of single drivers follow *recorded* leaders. Here followers drive behind the *simulated* vehicles ahead
 of them, as in the simulator, so the error of one driver reaches all behind it. Only a vehicle without a

@@ -19,7 +19,7 @@ from limsim_jax.recordings import RecordingError, Source, as_recording
 from limsim_jax.traffic.car_following import CarFollowing, ballistic
 
 PERIOD = 60.0
-"""s, after which everybody is put where it was recorded again."""
+"""s, after which all vehicles are put where they were recorded."""
 
 SETTLE = 5.0
 """s after the start or entry of a vehicle that do not count: it is where it was recorded."""
@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 
 
 class Chains(NamedTuple):
-    """Followers behind one another, `W` periods of `T` steps with rows for `V` vehicles; or `[T, V]` of one.
+    """Followers behind one another: `W` periods, `T` steps, `V` vehicles; or `[T, V]`.
 
     Where a row does not follow, all its numbers are harmless.
     """
@@ -44,7 +44,7 @@ class Chains(NamedTuple):
     v_lead: Float[Array, "*W T V"]  # m/s
     a_lead: Float[Array, "*W T V"]  # m/s^2, of the step before
     length_lead: Float[Array, "*W T V"]  # m
-    leader: Int[Array, "*W T V"]  # row of the leader, -1 if it follows nobody in this period
+    leader: Int[Array, "*W T V"]  # row of the leader, -1 if it is not simulated in this period
     follows: Bool[Array, "*W T V"]
     fresh: Bool[Array, "*W T V"]  # begins to follow this leader
 
@@ -122,7 +122,7 @@ def link(found: Sequence[Segment], *, period: float = PERIOD, settle: float = SE
     counts, point = _samples(chains, dt, min(settle, period / 4))
     if not counts.any():
         raise ValueError(
-            f"nobody follows for longer than {min(settle, period / 4):g} s; a shorter 'settle' is needed"
+            f"no vehicle follows for longer than {min(settle, period / 4):g} s; a shorter 'settle' is needed"
         )
     sources = tuple(source for source, _ in sorted(windows))
     periods = tuple(f"{Path(source).name.split('.')[0]} {k * period:g} s" for source, k in sorted(windows))
@@ -156,7 +156,7 @@ def _window(
 
 
 def _samples(chains: Chains, dt: float, settle: float) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """What is compared, and the point of the fundamental diagram that each sample belongs to."""
+    """Which samples are compared, and their points of the fundamental diagram."""
     follows = np.asarray(chains.follows)
     count, length, _ = follows.shape
     step = np.arange(length)[None, :, None]
@@ -192,7 +192,7 @@ def linked_recordings(
 def simulate(
     model: CarFollowing, parameters: Float[Array, "V P"], chains: Chains, dt: float
 ) -> tuple[Float[Array, "T V"], Float[Array, "T V"]]:
-    """Gap, m, and speed, m/s, of the followers of one period behind each other.
+    """Gap, m, and speed, m/s, of followers behind one another.
 
     A vehicle starts at its recorded speed and place; from then on it is `u` metres ahead of its record.
     When it gets another leader, its gap is the recorded one and what both are ahead.

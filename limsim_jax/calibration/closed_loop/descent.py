@@ -41,7 +41,7 @@ Floats = NDArray[np.float64]
 
 
 def scores(draws: int, drivers: int, seed: int) -> Float[Array, "K D P"]:
-    """Standard normal scores of all drivers, cut at `CUT` as those of the simulator."""
+    """Standard normal scores of all drivers, cut at `CUT`."""
     rng = np.random.default_rng(seed)
     drawn = truncnorm.rvs(-CUT, CUT, size=(draws, drivers, len(PARAMETERS)), random_state=rng)
     return jnp.asarray(drawn, jnp.float32)
@@ -56,7 +56,7 @@ def drawn(
 
 
 def default_drivers(draws: int, drivers: int, seed: int, speed_limit: float) -> Float[Array, "K D P"]:
-    """Drivers of cars as the simulator has them by default, in the order of `PARAMETERS`."""
+    """Default drivers of cars in the simulator, in the order of `PARAMETERS`."""
     them = sample_vehicles(
         default_population({"car": 1.0}), jax.random.key(seed), jnp.arange(draws * drivers)
     )[0]

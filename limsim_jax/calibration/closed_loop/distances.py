@@ -47,7 +47,7 @@ class Distances(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Recorded numbers and where they are, `M` samples, `F` points of the fundamental diagram."""
+    """Recorded numbers: `M` samples, `F` points of the fundamental diagram."""
 
     who: Int[Array, "W V"]  # driver of the row
     at: Int[Array, " M"]  # in a period, step and vehicle, flat
@@ -76,7 +76,7 @@ def samples(linked: Linked) -> Samples:
 def edie(
     recorded: Samples, gap: Array, v: Array, points: int, counts: Array | None = None
 ) -> tuple[Array, Array]:
-    """Density, 1/m, and flow, 1/s, of the points `[K F]`, by Edie's definitions.
+    """Density, 1/m, and flow, 1/s, `[K F]`, by Edie's definitions.
 
     A vehicle covers the road from its front to the front of its leader; the region of a point are these
     stretches over a slice of time: density is the time spent in it by its area, flow the distance.
@@ -93,13 +93,13 @@ def edie(
 def _flow_at(density: Array, k: Array, q: Array) -> Array:
     """Flow at some densities, from points: kernel regression, a tenth wide."""
     off = (jnp.log(jnp.maximum(k.reshape(-1), 1e-9))[None] - jnp.log(density)[:, None]) / 0.1
-    # Somebody is nearest: of far points the nearest count.
+    # One point is always nearest: of far points the nearest count.
     return jax.nn.softmax(-0.5 * off * off, axis=-1) @ q.reshape(-1)
 
 
 @partial(jax.jit, static_argnames="points")
 def _recorded_flow(recorded: Samples, counts: Array, points: int) -> Array:
-    """Flow of some of the recorded samples at the densities that are compared."""
+    """Flow of some recorded samples at the compared densities."""
     k, q = edie(recorded, recorded.gap[None], recorded.v[None], points, counts)
     return _flow_at(recorded.density, k, q)
 
@@ -111,7 +111,7 @@ def headway(gap: Array, v: Array, length_lead: Array) -> Array:
 
 @partial(jax.jit, static_argnames="points")
 def distances(recorded: Samples, gap: Float[Array, "K M"], v: Float[Array, "K M"], points: int) -> Distances:
-    """Of `K` simulations from the record, given gaps and speeds at its samples."""
+    """Distances of `K` simulations from the record, over its samples."""
     flat = headway(gap, v, recorded.length_lead[None]).reshape(-1), v.reshape(-1), gap.reshape(-1)
     log = headway(recorded.gap, recorded.v, recorded.length_lead), recorded.v, recorded.gap
     flow, known = (
@@ -129,7 +129,7 @@ def distances(recorded: Samples, gap: Float[Array, "K M"], v: Float[Array, "K M"
 def simulate_samples(
     model: CarFollowing, parameters: Float[Array, "K D P"], chains: Chains, recorded: Samples, dt: float
 ) -> tuple[Float[Array, "K M"], Float[Array, "K M"]]:
-    """Gaps, m, and speeds, m/s, of `K` simulations of all periods, where the record is compared.
+    """Gaps, m, and speeds, m/s, of `K` simulations at the compared samples.
 
     Args:
       model: of car following.
@@ -147,10 +147,10 @@ def simulate_samples(
 
 @partial(jax.jit, static_argnames="points")
 def from_own(recorded: Samples, gap: Float[Array, "K M"], v: Float[Array, "K M"], points: int) -> Distances:
-    """Distances of one of `K` >= 2 simulations, as if it were the record, from the others; the mean.
+    """Mean distance of one of `K` >= 2 simulations from the others.
 
-    Other drivers are drawn each time, so this is left when a population is exactly right, of a record of
-    this size and with these leaders. Arguments as of `distances`.
+    Each is taken for the record once. Other drivers are drawn each time, so an exactly right population is
+    as far from a record of this size and with these leaders. Arguments as of `distances`.
     """
 
     def one(k: Array) -> Distances:
@@ -163,7 +163,7 @@ def from_own(recorded: Samples, gap: Float[Array, "K M"], v: Float[Array, "K M"]
 
 
 def floor(linked: Linked, splits: int = 8, seed: int = 0) -> Distances:
-    """Distances between two halves of the recorded drivers, the mean over random splits."""
+    """Mean distances between two halves of the recorded drivers."""
     rng = np.random.default_rng(seed)
     recorded = samples(linked)
     points = int(recorded.point.max()) + 1

@@ -69,11 +69,11 @@ class ClosedLoop:
     seconds: float
 
     def falls(self) -> dict[str, float]:
-        """What is left of each distance from the default population, on held-out periods: 0.5 is a half."""
+        """Share of the default population's distances that is left, on held-out periods."""
         return self._of_default(self.held_out["closed_loop"])
 
     def reachable(self) -> dict[str, float]:
-        """What would be left if the population were exactly right: as far as the record has it, the least."""
+        """Share that would be left if the population were exactly right."""
         return self._of_default(self.from_own)
 
     def _of_default(self, found: Distances) -> dict[str, float]:
@@ -176,7 +176,10 @@ def hold_out(linked: Linked, turns: int = TURNS) -> list[list[int]]:
 
 
 def outside(found: Sequence[Segment], linked: Linked, periods: Sequence[int]) -> list[Segment]:
-    """What of the segments is not in these periods: parts of at least `LEAST` s, or as long as they were."""
+    """Parts of the segments outside these periods, of at least `LEAST` s.
+
+    A segment that was shorter stays if it is whole.
+    """
     spans = {source: [] for source in linked.sources}
     for k in periods:
         spans[linked.sources[k]].append(linked.spans[k])
