@@ -200,13 +200,13 @@ def table(found: dict[str, Any]) -> str:
         lines += [
             "Followers simulated behind one another; only those without a leader in the recording follow",
             "their logs. Distances from the recording: Wasserstein-1 of time headways, speeds and gaps,",
-            "difference of mean speeds, and of flows at equal densities (Edie). Drivers drawn from:",
-            "the simulator's default population, the population of fits to single drivers, and that one",
-            "adjusted in closed loop. *Held out*: every period is simulated with populations that were",
-            "fitted without it, in three turns; distances of all periods together. *Halves*: between two halves of the recorded",
-            "drivers. *Own record*: of a record that the populations of closed loop have made themselves,",
-            "with other draws of their drivers; as far is one that is exactly right.",
-            "ACC-IDM, the model of the simulator's traffic.",
+            "difference of mean speeds, and of flows at equal densities (Edie). Drivers are drawn from the",
+            "simulator's default population, from that of fits to single drivers, and from that one adjusted",
+            "in closed loop. *Held out*: every period is simulated with populations that were fitted without",
+            "it, in three turns; distances of all periods together. *Halves*: between two halves of the",
+            "recorded drivers. *Own record*: of a record that the closed-loop populations have made, from",
+            "other draws of their drivers; an exactly right population is as far. ACC-IDM, the model of the",
+            "simulator's traffic.",
             "",
             "| data | periods | drivers from | "
             + " | ".join(f"{name}, {UNITS[name]}" for name in names)

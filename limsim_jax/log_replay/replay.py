@@ -131,7 +131,7 @@ class Replay:
             "slot": slot,
             "ego": slot == self.ego[variant],
             "mode": np.array(_MODES)[np.asarray(moments.mode)],
-            "lane": np.where(lane == NO_LANE, None, ids[lane]),
+            "lane": np.where(lane == NO_LANE, np.array(None, object), ids[lane]),
             **{name: getattr(trace, name) for name in ("s", "d")},
             "x": x,
             "y": y,
