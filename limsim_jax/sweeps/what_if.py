@@ -68,5 +68,5 @@ def stopped(episodes: Episodes, seed: int, times: Sequence[float]) -> Stopped:
     for _ in range(max(wanted)):
         carries.append(decide(lane_map, schedule, carries[-1]))
     then = jax.tree.map(lambda *x: jnp.stack(x), *(carries[k] for k in wanted))
-    fresh = jax.jit(jax.vmap(run.anew, (None, 0, 0)))(lane_map, then.state, then.memory)
+    fresh = jax.jit(jax.vmap(run.restart, (None, 0, 0)))(lane_map, then.state, then.memory)
     return Stopped(run, lane_map, schedule, key, fresh)
