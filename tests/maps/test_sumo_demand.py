@@ -107,7 +107,7 @@ def test_bologna():
     assert len(demand.stop_places) == 25
     private = demand.type_distributions["private"]
     assert private.members[0] == "passenger1" and sum(private.weights) == pytest.approx(1.15)
-    assert demand.report.counts["additional/tlLogic", Action.IGNORED] == 8
+    assert demand.report.counts["add/tlLogic", Action.IGNORED] == 8
     assert demand.report.counts["stop", Action.READ] == 499
     bus = demand.vehicles["11_0"]
     assert bus.depart_lane == "best" and bus.depart_pos == 0.0 and bus.arrival_pos == -1.0
@@ -122,7 +122,7 @@ def test_configurations():
         read_sumocfg(SUMO / "limsim_town01" / "Town01.sumocfg")
     town05 = read_sumocfg(SUMO / "limsim_town05" / "Town05.sumocfg")
     assert [p.name for p in town05.routes] == ["carlavtypes.rou.xml", "Town05.rou.xml"]
-    assert town05.report.counts["input/gui-settings-file", Action.IGNORED] == 1
+    assert town05.report.counts["gui_only/gui-settings-file", Action.IGNORED] == 1
 
 
 # ---- against SUMO itself
