@@ -119,7 +119,9 @@ def distribution(results: Results, metric: str, *, ax: Axes | None = None, label
 
 
 def share_by_seeds(results: Results, metric: str, *, ax: Axes | None = None) -> Axes:
-    """Share of episodes in which a metric is above 0 as seeds come in, with Wilson's 95 % interval (%).
+    """Share of episodes with a metric above 0, over the seeds (%).
+
+    The band is Wilson's 95 % interval.
 
     Args and errors as for `distribution`.
     """
@@ -149,7 +151,9 @@ def paired(
     marked: str | None = "contacts",
     ax: Axes | None = None,
 ) -> Axes:
-    """Policy B against policy A, a dot per seed, with the mean difference in the title.
+    """Policy B against policy A, a dot per seed.
+
+    The title tells the mean difference and the p-value of the paired t-test.
 
     Args:
       results: of a sweep with both policies.
@@ -262,7 +266,7 @@ def around(
     after: float = 2.0,
     ax: Any = None,
 ) -> Any:
-    """Speeds of vehicles around a moment, and their distance if there are two.
+    """Speeds of vehicles around a moment, and the distance of two.
 
     Args:
       trace: `simulation.trace.Trace`, `[T, ...]`.
@@ -309,12 +313,12 @@ def _axes(ax: Axes | None) -> Axes:
 
 
 def _stored(results: Any) -> Results:
-    """The results in a directory, also of the `Results` of the public API."""
+    """Stored results, also those behind the public `Results`."""
     return getattr(results, "stored", results)
 
 
 def _parts(results: Results) -> dict[str, pa.Table]:
-    """Episodes with their shares, by a name as short as it can be."""
+    """Episodes with their shares, by the shortest name that tells them apart."""
     stored = _stored(results)
     parts = groups(stored)
     several = len({scenario for scenario, _ in parts}) > 1

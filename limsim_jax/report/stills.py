@@ -64,7 +64,7 @@ class Captions:
 
 
 class MapPage:
-    """The whole map, in strips if it is long and thin, or one window."""
+    """The whole map (in strips if long and thin), or one window."""
 
     def __init__(
         self,

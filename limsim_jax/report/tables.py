@@ -95,7 +95,7 @@ COMPARED = (
 
 
 def groups(results: Results) -> dict[Group, pa.Table]:
-    """Episodes of each (scenario, policy) by seed, in the order of the provenance.
+    """Episodes of each (scenario, policy), sorted by seed.
 
     Raises `ValueError` if there are none.
     """
@@ -150,7 +150,7 @@ def kind_of(meaning: str) -> Kind:
 
 
 def better(metric: str) -> int:
-    """1 if more of a metric is better, -1 if less, 0 if neither."""
+    """1: more is better, -1: less is better, 0: neither."""
     if metric.startswith("min_") and not metric.endswith("_time"):
         return 1
     if metric.startswith(("nuplan_", "carla_", "limsim_")):

@@ -430,8 +430,8 @@ def test_it_runs_in_a_frame_of_a_notebook(page, tmp_path, browser):
     srcdoc = page.read_text().replace("&", "&amp;").replace('"', "&quot;")
     look = """const look = () => { const body = document.querySelector('iframe').contentDocument.body;
         const data = body && body.dataset;
-        if (data && (data.ready || data.error)) Object.assign(document.body.dataset, data);
-        else setTimeout(look, 20); }; look();"""
+        if (data && (data.ready || data.error)) { Object.assign(document.body.dataset, data); return; }
+        setTimeout(look, 20); }; look();"""
     sandbox = 'sandbox="allow-scripts allow-same-origin"'
     outer.write_text(f'<body><iframe srcdoc="{srcdoc}" {sandbox}></iframe><script>{look}</script>')
     state = browser.open(outer)

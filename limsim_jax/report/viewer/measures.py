@@ -65,7 +65,7 @@ def _times(
 def _way_ahead(
     lane_map: LaneMap, trace: Any, valid: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Lanes ahead of every vehicle and the metres to them, `[T, N, D]`.
+    """Lanes ahead of every vehicle, and their distances (m), `[T, N, D]`.
 
     The first lane is its own.
 

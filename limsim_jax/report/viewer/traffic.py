@@ -41,7 +41,7 @@ def add_traffic(pack: Pack, lane_map: LaneMap, trace: Any) -> None:
 
 
 def add_driven(pack: Pack, lane_map: LaneMap, trace: Any, ego: int | None) -> Any:
-    """Add classes, vehicles that the policy drives, plans, and the way to the goal.
+    """Add classes, driven vehicles, plans, and the way to the goal.
 
     Returns the rows and points of plans, and the points per second. A plan is stored when it is made.
     """
