@@ -31,7 +31,7 @@ _hooked += [f"limsim_jax.traffic.demand.{name}" for name in _demand]
 _hooked += [
     f"limsim_jax.traffic.right_of_way.{x}" for x in ("approaches", "meet", "passage", "rules", "stops")
 ]
-_hooked += [f"limsim_jax.policies.{name}" for name in ("area", "base", "host", "perception", "simple")]
+_hooked += [f"limsim_jax.policies.{name}" for name in ("base", "perception", "simple")]
 _limsim_tm = "decide", "group", "plan", "policy", "search"
 _hooked += [f"limsim_jax.policies.limsim_tm.{name}" for name in _limsim_tm]
 _pdm = "learned", "policy", "proposals", "road", "score", "tracker"

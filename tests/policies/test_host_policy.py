@@ -248,7 +248,7 @@ def test_numbers_that_are_not_finite_end_the_run():
 def experiment(policy) -> ExperimentFile:
     told = {
         "name": "host", "map": "highway", "horizon": 2.0, "slots": 8,
-        "ego": {"start": "1-", "s": 60.0, "goal": "2-", "policy": f"test_host_policy:{policy}"},
+        "ego": {"start": "1-", "s": 60.0, "goal": "2-", "policy": f"{__name__}:{policy}"},
         "traffic": {"vehicles": 3},
     }  # fmt: skip
     return ExperimentFile.model_validate(told)
