@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from limsim_jax.maps.signals import SignalState
+from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.policies.base import Policy
 from limsim_jax.policies.host import HostPolicy
 from limsim_jax.policies.reference import reference_path

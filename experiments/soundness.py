@@ -24,7 +24,8 @@ from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, bundled_maps, read_network
 from limsim_jax.maps.conflicts import ConflictTable, ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
-from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import lane_states
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweeps.build import plain_demand

@@ -35,8 +35,8 @@ from numpy.typing import NDArray
 from limsim_jax.geometry import derivative, direction, polynomial, wrap_angle
 from limsim_jax.maps.conflicts import ConflictTable
 from limsim_jax.maps.network import LaneType, Network
-from limsim_jax.maps.routing import RouteTable
-from limsim_jax.maps.signals import SignalTable
+from limsim_jax.maps.route_table import RouteTable
+from limsim_jax.maps.signal_table import SignalTable
 from limsim_jax.numerics import safe_divide, safe_sqrt
 from limsim_jax.xla import computed_once
 

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, width
-from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import lane_states
 from limsim_jax.metrics.safety import NO_GAP, Zones
 from limsim_jax.metrics.step import EgoStep
 from limsim_jax.metrics.traffic import TrafficStep

@@ -38,7 +38,8 @@ import numpy as np
 
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
-from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import lane_states
 from limsim_jax.policies.base import Policy, snake_case
 from limsim_jax.policies.predict import constant_velocity, nearest
 from limsim_jax.policies.reference import reference_path

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from limsim_jax.maps.lane_map import LaneMap, absolute
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.outline import Bounds, signal_bars
-from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import lane_states
 from limsim_jax.report.draw import TRAFFIC_ZORDER, draw_network
 from limsim_jax.report.draw.painter import INK
 from limsim_jax.report.ending import ending, without_arrived

@@ -18,7 +18,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, room_beside
 from limsim_jax.maps.routing import NO_ROOM
-from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import lane_states
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
 from limsim_jax.traffic.collision import AfterCollision, after_collision
 from limsim_jax.traffic.collision import record as record_events

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.maps.signals import SignalState, lane_states, phase_at
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import lane_states, phase_at
 from limsim_jax.types import Config, Lights, State
 
 GAP = 3.0

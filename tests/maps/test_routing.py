@@ -12,8 +12,8 @@ from synthetic import intersection, network, rows, shuffled, straight
 
 from limsim_jax.maps import read_network
 from limsim_jax.maps.network import MapError
+from limsim_jax.maps.route_table import FAR
 from limsim_jax.maps.routing import (
-    FAR,
     NO_ROOM,
     NO_WAY,
     ROOM_TO_CHANGE,

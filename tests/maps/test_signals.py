@@ -26,8 +26,8 @@ from limsim_jax.maps.network import (
     TrafficLight,
     Turn,
 )
+from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import (
-    SignalState,
     all_red_time,
     build_signals,
     generate_programs,

@@ -30,7 +30,8 @@ from observed_worlds import (
 
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
-from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import lane_states
 from limsim_jax.metrics.observer import EvaluateEgo
 from limsim_jax.metrics.record import meets_ego
 from limsim_jax.metrics.safety import NO_GAP

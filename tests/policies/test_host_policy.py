@@ -12,7 +12,7 @@ import pytest
 from traffic_worlds import bundled, no_arrivals, state_of
 
 from limsim_jax.maps.lane_map import lane_rows, pose
-from limsim_jax.maps.signals import SignalState
+from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.policies import host
 from limsim_jax.policies.host import HostPolicy, Observe
 from limsim_jax.simulation.rollout import Rollout

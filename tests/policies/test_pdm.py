@@ -12,7 +12,8 @@ from traffic_worlds import bundled, drivers, no_arrivals, shapes, state_of
 
 from limsim_jax.geometry import boxes_overlap
 from limsim_jax.maps.lane_map import lane_rows
-from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import lane_states
 from limsim_jax.metrics.motion import motion_init, motion_result, motion_update
 from limsim_jax.policies.pdm import PDMClosed
 from limsim_jax.policies.pdm import proposals as pdm_proposals

@@ -15,7 +15,7 @@ from PIL import Image
 
 from limsim_jax.maps.lane_map import absolute, lane_rows
 from limsim_jax.maps.outline import signal_bars
-from limsim_jax.maps.signals import SignalState
+from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.report import video
 from limsim_jax.report.ending import ending
 from limsim_jax.report.frames import COLLIDED, EGO, SIGNALS, Scene, draw_frame

@@ -29,7 +29,7 @@ from fake_replays import (
 )
 
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES, absolute, lane_ids
-from limsim_jax.maps.signals import SignalState
+from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.report.frames import EGO, SIGNALS
 from limsim_jax.report.viewer import DRIVEN, write_viewer
 from limsim_jax.simulation.trace import Trace

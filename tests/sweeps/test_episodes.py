@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from limsim_jax.maps.lane_map import NO_LANE
-from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import lane_states
 from limsim_jax.metrics.safety import encounter, overlaps
 from limsim_jax.policies.simple import ConstantSpeed, FollowLane
 from limsim_jax.sweeps.episode import Episodes, _succeeds

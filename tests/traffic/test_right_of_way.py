@@ -17,7 +17,8 @@ from limsim_jax.maps.lane_map import LaneMap, lane_rows
 from limsim_jax.maps.network import Control
 from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.maps.routing import default_goals
-from limsim_jax.maps.signals import SignalState, phase_at
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import phase_at
 from limsim_jax.simulation.rollout import Rollout, world_key
 from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Command, Traffic, decide, drive

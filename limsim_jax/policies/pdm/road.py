@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, side_s, width
-from limsim_jax.maps.signals import SignalState, lane_states
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import lane_states
 from limsim_jax.policies.predict import Predictor, nearest
 from limsim_jax.policies.reference import ReferencePath, path_from
 from limsim_jax.types import State

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from limsim_jax.files import write_whole
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES, LaneMap, absolute, lane_ids
 from limsim_jax.maps.network import Network
-from limsim_jax.maps.signals import SignalState
+from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.metrics.moments import RESPONSIBLE, value_text, words
 from limsim_jax.report.ending import ending, shown_steps, without_arrived
 from limsim_jax.report.frames import COLLIDED, DRIVEN, EGO, SIGNALS

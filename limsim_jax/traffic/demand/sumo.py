@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, LaneMap, bucket, lane_rows
 from limsim_jax.maps.network import Lane, MapError, Network
-from limsim_jax.maps.routing import RouteTable, build_fixed_routes, build_routes
+from limsim_jax.maps.route_table import RouteTable
+from limsim_jax.maps.routing import build_fixed_routes, build_routes
 from limsim_jax.maps.sumo.records import Demand, Flow, Vehicle, VehicleType
 from limsim_jax.traffic.demand.arrays import NEVER
 from limsim_jax.traffic.demand.sample import departure_place, entry_speed, typical_vehicles

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.maps.signals import SignalState
+from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.neighbors import Pair
 from limsim_jax.traffic.parameters import JUNCTIONS
