@@ -125,7 +125,7 @@ def _counts(v: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
 # --- rollouts ----------------------------------------------------------------------------------------
 
 
-def driver(parameters: Float[Array, " P"]) -> tuple[Driver, Float[Array, ""]]:
+def driver(parameters: Float[Array, " P *b"]) -> tuple[Driver, Float[Array, "*b"]]:
     """A driver with these parameters, and its desired speed v0."""
     v0, time_gap, s0, a, b = parameters
     values = dict.fromkeys((field.name for field in fields(Driver)), jnp.zeros_like(v0))
@@ -292,7 +292,12 @@ class _Descent(NamedTuple):
 
 @partial(jax.jit, static_argnames=("problem",))
 def _levenberg_marquardt(
-    problem: Problem, u: Array, data: Data, prior: Prior | None, iterations: int, tolerance: float
+    problem: Problem,
+    u: Array,
+    data: Data,
+    prior: Prior | None,
+    iterations: int | Array,
+    tolerance: float | Array,
 ) -> tuple[Array, Array]:
     """Points `[D, S, P]` and costs `[D, S]` of all starts; several dampings at once."""
 

@@ -141,7 +141,7 @@ def build_arrays(recorded: Tracks, lane_map: LaneMap) -> SceneArrays:
     touched = ((clearance < 0) & (clearance < 0).swapaxes(1, 2)).any(0)
     driver, v0 = _drivers(recorded, p, v, valid, seen)
 
-    def floats(array: Floats) -> Array:
+    def floats(array: NDArray[Any]) -> Array:
         return jnp.asarray(array, jnp.float32)
 
     log = Log(
@@ -233,7 +233,9 @@ def _cell(scene: SceneArrays, p: Array) -> tuple[Array, Array]:
 # --- on the host -------------------------------------------------------------------------------------
 
 
-def _places(lane_map: LaneMap, x: Floats, y: Floats, heading: Floats) -> tuple[Any, Floats, Floats]:
+def _places(
+    lane_map: LaneMap, x: Floats, y: Floats, heading: Floats
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Lane, s and d of all entries."""
     found = jax.jit(project)(lane_map, *(jnp.asarray(a.ravel(), jnp.float32) for a in (x, y, heading)))
     lane, s, d = (np.asarray(a).reshape(x.shape) for a in found[:3])
@@ -253,7 +255,7 @@ class _Onward:
         self.network, self.ids = network, lane_ids(network)
         self.origin = np.asarray(lane_map.origin, float)
 
-    def walk(self, end: Floats, row: int, s: float, d: float) -> tuple[Floats, float]:
+    def walk(self, end: Floats, row: Any, s: Any, d: Any) -> tuple[Floats, float]:
         """Points `GRID` m apart after the `end`, and m of road left.
 
         Args:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from flax import struct
@@ -155,6 +155,7 @@ class Flight(NamedTuple):
     memory: Any  # of the pilot
 
 
+@runtime_checkable
 class Pilot(Protocol):
     """Drives an ego in the plane, from the first told moment on."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,7 +116,7 @@ def _recording(
     lead: Ints,
     x_lead: Floats,
     speed_limit: float = math.nan,
-    **more: NDArray[np.float64],
+    **more: NDArray[Any],
 ) -> Recording:
     """A recording of sorted rows. `lead`: row of each leader, or -1."""
     there = lead >= 0

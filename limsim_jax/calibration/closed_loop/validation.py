@@ -191,7 +191,7 @@ def outside(found: Sequence[Segment], linked: Linked, periods: Sequence[int]) ->
             keep &= (at < begin) | (at >= end)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(int)))
         least = min(LEAST, segment.duration) - 1.5 * segment.dt
-        parts = [segment.part(i, j) for i, j in zip(edges[::2], edges[1::2], strict=True)]
+        parts = [segment.part(i, j) for i, j in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)]
         left += [part for part in parts if part.duration >= least]
     return left
 
