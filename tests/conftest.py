@@ -40,6 +40,10 @@ _hooked += [
     f"limsim_jax.metrics.{name}"
     for name in ("blame", "ego", "motion", "observer", "record", "safety", "scores", "traffic", "measures")
 ]
+_calibration = "cleaning", "fit", "matching", "population", "uncertainty"
+_hooked += [f"limsim_jax.calibration.{name}" for name in _calibration]
+_hooked += [f"limsim_jax.calibration.closed_loop.{name}" for name in ("chains", "descent", "distances")]
+_hooked += [f"limsim_jax.recordings.{x}" for x in ("checks", "lanelets", "leaders", "openacc", "recording")]
 install_import_hook(_hooked, "shape_checks.typecheck")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
