@@ -64,6 +64,9 @@ class Table:
           RecordingError: no rows, or a row has more or fewer values than the header.
         """
         names = header_of(data, header - 1)
+        rest = data.split(b"\n", header)
+        if len(rest) <= header or not rest[header].strip():
+            raise RecordingError(f"{path}: line {header + 1}: no rows; the file ends after its header")
         try:
             columns = pacsv.read_csv(
                 io.BytesIO(data),
@@ -73,8 +76,6 @@ class Table:
                 ),
             )
         except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-            if "Empty CSV" in str(error):
-                raise _no_rows(path, header) from None
             found = re.search(r"Row #(\d+): Expected (\d+) columns, got (\d+)", str(error))
             what = (
                 f"line {found[1]}: {found[3]} values; {found[2]} are expected, as in the header"
@@ -82,8 +83,6 @@ class Table:
                 else str(error).splitlines()[0]
             )
             raise RecordingError(f"{path}: {what}") from None
-        if not columns.num_rows:
-            raise _no_rows(path, header)
         return cls(path, columns, header)
 
     def __len__(self) -> int:
@@ -157,10 +156,6 @@ class Table:
         raise RecordingError(
             f"{self.source}: {self.row} {row + self.header + 1}, column {self.name(column)}: {message}"
         )
-
-
-def _no_rows(path: str | Path, header: int) -> RecordingError:
-    return RecordingError(f"{path}: line {header + 1}: no rows; the file ends after its header")
 
 
 def numbered(*columns: NDArray[np.str_]) -> tuple[tuple[str, ...], list[Ints]]:
