@@ -1,4 +1,4 @@
-"""How fast maps load, lanes are looked up, traffic runs and policies decide, on this machine.
+"""Speed on this machine: maps, look-ups, traffic and policies.
 
 Everything is timed in processes of its own: a cold start is then really cold, and on one core even the
 threads of XLA have only that core.
@@ -95,7 +95,7 @@ def bench_traffic(
     peer: bool = True,
     cold: bool = False,
 ) -> dict[str, Any]:
-    """Time traffic in many worlds on all cores, or on the accelerator if there is one; next to it SUMO.
+    """Time traffic in many worlds on all devices; next to it SUMO.
 
     Every world starts with about as many vehicles as it has slots, or as many as find room.
 
@@ -107,7 +107,7 @@ def bench_traffic(
         repeats: runs of which the median counts.
         rate: veh/h per origin.
         peer: run SUMO on the same map with the same flows, one process per core.
-        cold: compile with an empty cache, then load from it; else the user's cache is used.
+        cold: compile with an empty cache, then load from it; otherwise the user's cache is used.
 
     Returns:
         Figures by name; `vehicle_updates_per_s` counts vehicles on the road, `slot_updates_per_s` slots.
@@ -147,7 +147,7 @@ def bench_policy(
       policy: instead of the experiment's.
       worlds: of the batch.
       repeats: runs of which the median counts.
-      cold: compile with an empty cache; else the user's cache is used.
+      cold: compile with an empty cache; otherwise the user's cache is used.
 
     Returns:
       `latency_s`: of a call for one world from the host, on one core or on the accelerator;
@@ -267,7 +267,7 @@ def _cores() -> list[int]:
 
 
 def _child(stage: str, *arguments: str, cores: Sequence[int], cache: str | None) -> dict[str, Any]:
-    """Run a stage in a process of its own and return what it measured; `cache` None: that of the user."""
+    """Run a stage in its own process and return its figures; `cache` None: that of the user."""
     start = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-m", "limsim_jax.bench", ",".join(map(str, cores)), stage, *arguments],
@@ -459,7 +459,7 @@ def _traffic(path: str, told: str) -> dict[str, Any]:
 
 
 def _policy(experiment: str, told: str) -> dict[str, Any]:
-    """Time decisions of a policy at the start of the worlds of an experiment."""
+    """Time decisions of a policy at the start of worlds."""
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -514,7 +514,7 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
 
 
 def _full(network: Network, lane_map: LaneMap, rate: float, slots: int, seconds: float) -> Demand:
-    """Traffic that starts with as many vehicles as there are slots, or as find room."""
+    """Traffic that starts with full slots, or with full roads."""
     from limsim_jax.sweeps.build import plain_demand
 
     vehicles = slots
@@ -589,7 +589,7 @@ def _sumo_network(path: Path, folder: Path) -> Path:
 
 
 def _sumo_demand(net: Any, folder: Path, rate: float, vehicles: int, seconds: float) -> Path:
-    """Flows from every edge into the network to every way out in equal shares; vehicles at the start."""
+    """Flows from every entry to every exit in equal shares; vehicles at the start."""
     edges = {edge.getID(): edge for edge in net.getEdges() if edge.allows("passenger")}
     after = {
         name: [x.getID() for x in edge.getOutgoing() if x.getID() in edges] for name, edge in edges.items()
@@ -648,7 +648,7 @@ def _sumo(net: str, routes: str, seconds: str) -> dict[str, Any]:
 
 
 def _time(function: Callable[..., Any], repeats: int, *arguments: Any) -> dict[str, float]:
-    """Compile time, and the median run time of a call once it is compiled."""
+    """Compile time, and the median time of a compiled call."""
     import jax
 
     jax.clear_caches()

@@ -17,13 +17,13 @@ Axis = int | Sequence[int] | None
 def safe_divide(
     numerator: Float[Array, "*#b"], denominator: Float[Array, "*#b"], default: float = 0.0
 ) -> Float[Array, "*#b"]:
-    """`numerator / denominator`, and `default` with zero gradient where the denominator is 0."""
+    """The quotient, and `default` with zero gradient where the denominator is 0."""
     zero = denominator == 0
     return jnp.where(zero, default, numerator / jnp.where(zero, 1, denominator))
 
 
 def safe_sqrt(x: Float[Array, "*#b"]) -> Float[Array, "*#b"]:
-    """Square root of `x`, and 0 with zero gradient where `x <= 0`."""
+    """Square root, and 0 with zero gradient where `x <= 0`."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
 

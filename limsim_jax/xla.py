@@ -115,7 +115,7 @@ def use_all_cores(cores: int | None = None) -> int:
 
 
 def enable_compilation_cache() -> None:
-    """Keep compiled programs on disk, unless JAX has a folder for them already."""
+    """Keep compiled programs on disk, unless JAX has a folder already."""
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "xla"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)

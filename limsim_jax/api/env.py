@@ -55,7 +55,9 @@ Reward = Callable[[Info, Info], Float[Array, " E"]]
 
 @dataclass(frozen=True)
 class ProgressReward:
-    """Metres towards the goal by a scale, less a penalty for a collision or a departure from the road.
+    """Scaled progress to the goal, less a penalty for collisions.
+
+    Departures from the road count as collisions do; the arrival earns a bonus.
 
     Attributes:
       scale: m per unit of reward.

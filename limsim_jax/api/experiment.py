@@ -173,7 +173,7 @@ class Experiment:
         chunk: int | None = None,
         metrics: Sequence[Metric] = (),
     ) -> Episodes:
-        """The worlds of this experiment under a policy, as the machinery of sweeps takes them."""
+        """The worlds of this experiment under a policy."""
         from limsim_jax.policies.base import policy_name
         from limsim_jax.sweeps.episode import Episodes
 

@@ -56,7 +56,9 @@ class Futures(Sequence[World]):
         return pa.Table.from_pylist(rows)
 
     def trajectories(self) -> pa.Table:
-        """All vehicles of all futures in one long table, with columns `policy` and `copy`."""
+        """All vehicles of all futures in one long table.
+
+        Columns `policy` and `copy` come first."""
         keys = self.table().select(["policy", "copy"]).to_pylist()
         parts = []
         for key, world in zip(keys, self.worlds, strict=True):

@@ -90,7 +90,7 @@ class Results:
         return summary(self.stored)
 
     def summary(self) -> pa.Table:
-        """Every metric of every scenario and policy with its interval, spread and number of values."""
+        """Every metric with its interval, spread and number of values."""
         return self._summary
 
     def table(self) -> TextTable:
@@ -205,7 +205,9 @@ class Results:
         return self._made[group]
 
     def report(self, path: str | Path | None = None, *, worst: int = 6) -> Path:
-        """Write the report, an HTML page, and beside it replays of the worst episodes.
+        """Write the report as an HTML page.
+
+        Replays of the worst episodes lie beside it.
 
         Args:
           path: of the page; None: `report.html` in the folder of the results.

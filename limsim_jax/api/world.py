@@ -140,7 +140,7 @@ class World:
         change: Callable[[State, Any], State] | None = None,
         seconds: float | None = None,
     ) -> Futures:
-        """Stop the world at a moment and run on from there, as often as you like.
+        """Stop the world at a moment and run on from there.
 
         Args:
           at: s, rounded to whole decisions.

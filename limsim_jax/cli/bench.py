@@ -88,7 +88,9 @@ def maps(
         list[int] | None, typer.Option(min=1, help="Look-ups per call; may be given several times.")
     ] = None,
 ) -> None:
-    """Time a map from file to device arrays, cold and from cache, and look-ups on its lanes."""
+    """Time a map from file to device arrays, and its look-ups.
+
+    Both are timed cold and from the cache."""
     from limsim_jax.bench import bench_maps, markdown
 
     result = bench_maps(path(file), all_cores=all_cores, repeats=repeats, batches=batch or [1_000, 100_000])

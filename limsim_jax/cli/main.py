@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _is_ours(error: ValueError) -> bool:
-    """Whether our own code has raised it, to tell the user what to do."""
+    """Whether our own code has raised it as a message."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next

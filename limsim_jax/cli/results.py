@@ -73,7 +73,7 @@ def sweep(
     ] = None,
     chunk: Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Run on so many Ray workers (needs the extra 'ray').")
+        int | None, typer.Option(help="Number of Ray workers to run on (needs the extra 'ray').")
     ] = None,
     address: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Ray cluster.  [default: this machine]")
@@ -135,7 +135,9 @@ def report(
     csv: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the tables as CSV, too.")] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Print the main metrics with intervals, and write a page with plots and the worst episodes."""
+    """Print the main metrics with intervals, and write the report.
+
+    The report is a page with plots and the worst episodes."""
     opened, table = _print_headline(results)
     if csv is not None:
         from limsim_jax.report.tables import write_csv
@@ -184,7 +186,9 @@ def verify(
     sample: Annotated[int, typer.Option(min=1, help="Worlds of each scenario to run again.")] = 16,
     seed: Annotated[int, typer.Option(help="Of the choice.")] = 0,
 ) -> None:
-    """Run a random sample of stored worlds again, and compare every number and the final state."""
+    """Run a sample of stored worlds again and compare them.
+
+    Every number and the final state must be equal."""
     from limsim_jax.api.results import rebuild
     from limsim_jax.sweeps.runner import verify as verify_results
     from limsim_jax.sweeps.store import open_results

@@ -151,7 +151,7 @@ def _traffic(file: str, *, rate: float, vehicles: int, seconds: float, slots: in
 
 
 def _check_outputs(video: Path | None, picture: Path | None, trace_file: Path | None) -> None:
-    """Refuse files that could not be written in the end, before anything takes long."""
+    """Refuse files that cannot be written before anything takes long."""
     try:
         if video is not None or picture is not None:
             from limsim_jax.report.video import PICTURE_SUFFIXES, VIDEO_SUFFIXES, check_suffix
@@ -174,7 +174,7 @@ def _check_outputs(video: Path | None, picture: Path | None, trace_file: Path | 
 
 
 def _outcome(totals: Totals) -> dict[str, Any]:
-    """Totals of one world as plain values, and the means that they give."""
+    """Totals of one world as plain values, and their means."""
     plain = {name: value.item() for name, value in vars(totals).items()}
     distance, driven, travel = plain.pop("distance"), plain.pop("time"), plain.pop("travel_time")
     return plain | {
@@ -208,7 +208,7 @@ def _show(title: str, arrivals: str, summary: dict[str, Any]) -> None:
             ("collided", str(summary["collided"])),
             ("other incidents", ", ".join(others) or "none"),
             ("mean speed", number("mean_speed", "m/s")),
-            ("mean travel time", number("mean_travel_time", "s, of those who left")),
+            ("mean travel time", number("mean_travel_time", "s, of vehicles that left")),
             ("hardest braking", number("deceleration", "m/s^2")),
             ("longest wait", number("longest_wait", "s")),
             ("compile", number("compile_s", "s")),

@@ -14,12 +14,12 @@ from limsim_jax.files import write_whole
 
 
 def fork(tree: Any, n: int) -> Any:
-    """`n` copies of a world (a state, or state, memory and totals) along a new first axis."""
+    """`n` copies of a pytree along a new first axis."""
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *jnp.shape(x))), tree)
 
 
 def save(path: str | Path, tree: Any) -> None:
-    """Write any pytree of arrays (a state, a carry of `Rollout.advance`) as .npz; never half a file."""
+    """Write a pytree of arrays as .npz; never half a file."""
     found = jax.tree_util.tree_leaves_with_path(tree)
     leaves: dict[str, Any] = {jax.tree_util.keystr(where): np.asarray(x) for where, x in found}
     file = io.BytesIO()
@@ -28,7 +28,7 @@ def save(path: str | Path, tree: Any) -> None:
 
 
 def load(path: str | Path, like: Any) -> Any:
-    """Read what `save` wrote into the structure of `like` (of the same shapes).
+    """Read what `save` wrote into the structure of `like`.
 
     Raises:
       ValueError: an array that is missing or of another shape or type.

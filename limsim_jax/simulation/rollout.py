@@ -100,7 +100,7 @@ class Rollout:
 
     @property
     def _free(self) -> bool:
-        """Whether anybody may leave the lanes."""
+        """Whether any vehicle may leave the lanes."""
         return self.policy.free or getattr(self.policy, "others", 0) > 0
 
     def __call__(self, lane_map: LaneMap, scenario: Scenario, key: Key[Array, ""]) -> Result:
@@ -129,7 +129,9 @@ class Rollout:
         carry: Carry,
         decisions: int | None = None,
     ) -> tuple[Result, Carry]:
-        """Run on, up to the horizon or for so many decisions; gives back how to run on from there."""
+        """Run on to the horizon or for a number of decisions.
+
+        Returns the result, and the carry to run on from there."""
         config, measure = self.config, self.measure
         trace = None if self.record is None else self.record(lane_map)
 
@@ -172,7 +174,7 @@ Sampler = Callable[[Key[Array, ""]], Scenario]
 
 
 class Started(NamedTuple):
-    """A world before its first decision, and all that `Rollout.advance` needs beside the map."""
+    """A world before its first decision."""
 
     schedule: Schedule
     key: Key[Array, ""]  # of the policy

@@ -16,7 +16,7 @@ from limsim_jax.types import Status
 
 
 def trajectory_table(network: Network, lane_map: LaneMap, trace: Trace, **constants: Any) -> pa.Table:
-    """A row per time and vehicle on the road, in the order of time.
+    """A row per time and vehicle, in the order of time.
 
     Columns: time (s), vehicle (number; below 0: there at the start), slot, class, driven (by a policy),
     lane (id), s (m along the lane, front bumper), d (m, left of its centre), x, y (m, centre of the body,
@@ -59,7 +59,7 @@ def write_trace(path: Path, network: Network, lane_map: LaneMap, trace: Trace) -
 def _columns(
     network: Network, lane_map: LaneMap, trace: Trace
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Arrays `[T, N]` by name, and the names that the numbers of some of them stand for."""
+    """Arrays `[T, N]` by name, and what some numbers stand for."""
     x, y = absolute(lane_map, trace.box[..., 0], trace.box[..., 1])
     slot = np.broadcast_to(np.arange(trace.active.shape[1]), trace.active.shape)
     columns: dict[str, np.ndarray] = {

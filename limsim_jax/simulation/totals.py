@@ -24,7 +24,7 @@ class Totals:
     entered: Int[Array, ""]  # those of the start included
     left: Int[Array, ""]  # at their goals
     waiting: Int[Array, ""]  # outside, for room to enter
-    full: Int[Array, ""]  # decisions at which somebody could not enter for want of a slot
+    full: Int[Array, ""]  # decisions at which a vehicle could not enter for want of a slot
     collided: Int[Array, ""]
     off_road: Int[Array, ""]
     wrong_way: Int[Array, ""]
@@ -37,7 +37,7 @@ class Totals:
     longest_wait: Float[Array, ""]  # s
     distance: Float[Array, ""]  # m, of all vehicles
     time: Float[Array, ""]  # s, of all vehicles on the road
-    travel_time: Float[Array, ""]  # s, of those who have left, together
+    travel_time: Float[Array, ""]  # s, sum over vehicles that left
 
 
 class Stood(NamedTuple):
@@ -60,7 +60,7 @@ def no_totals(state: State) -> Totals:
 
 @jax.named_scope("count")
 def count(config: Config, totals: Totals, stood: Stood, before: State, after: State) -> tuple[Totals, Stood]:
-    """Totals after one decision more, all but `waiting`; and who has got on."""
+    """Totals and progress after one more decision, all but `waiting`."""
     now = config.time(after.step)
     same = (before.vehicle == after.vehicle) & (before.entered == after.entered) & before.active
     entered = jnp.sum(after.queues.next - before.queues.next, dtype=jnp.int32)

@@ -15,7 +15,7 @@ from limsim_jax.types import State
 
 
 class Trace(NamedTuple):
-    """The standard record of a step, for `N` slots and `E` rows of `Egos`.
+    """The record of a step: `N` slots, `E` rows of `Egos`.
 
     What is None is not known: nothing of egos in a world without, no plans of a policy that gives no
     trajectories.
@@ -33,7 +33,7 @@ class Trace(NamedTuple):
     status: Int[Array, " N"]
     phase: Int[Array, " P"]  # of the signal programs
     vehicle_class: Int[Array, " N"] | None = None  # row of `maps.lane_map.VEHICLE_CLASSES`
-    driven: Int[Array, " E"] | None = None  # slot that the policy drives, egos first; -1: nobody
+    driven: Int[Array, " E"] | None = None  # slot that the policy drives, egos first; -1: none
     to_go: Float[Array, ""] | None = None  # m of the first ego to its goal (`routes.distance`); NaN: none
     plan: Float[Array, "E H 2"] | None = None  # m, x and y planned at the decision; NaN: no trajectory
     plan_time: Float[Array, " H"] | None = None  # s, when
@@ -70,7 +70,7 @@ def trace(lane_map: LaneMap) -> Callable[[Tick], Trace]:
 
 
 def _plan(tick: Tick, driven: Int[Array, " E"] | None) -> tuple[Array | None, Array | None]:
-    """Trajectories of those that follow one, and the times of their samples (s)."""
+    """Planned trajectories, and the times of their samples (s)."""
     planned, egos = tick.command.trajectory, tick.state.egos
     if planned is None or driven is None:
         return None, None
@@ -80,7 +80,7 @@ def _plan(tick: Tick, driven: Int[Array, " E"] | None) -> tuple[Array | None, Ar
 
 
 def _to_go(lane_map: LaneMap, state: State) -> Float[Array, ""]:
-    """Metres from the front bumper of the first ego to the end of its goal; NaN: gone, or no way there."""
+    """Metres from the first ego to the end of its goal; NaN: gone, or no way there."""
     slot = state.egos.slot[0]
     lane = state.lane[slot]
     routes, goal = lane_map.routes, state.goal[slot]

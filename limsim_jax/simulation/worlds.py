@@ -26,7 +26,9 @@ from limsim_jax.xla import enable_compilation_cache, run_once
 def over_worlds(
     one: Callable[[LaneMap, Any], Any], mesh: Mesh, compiler_options: dict[str, Any] | None = None
 ) -> Any:
-    """A function of the map and one world, jitted for the map and `[B, ...]` worlds shared among devices."""
+    """A function of one world, jitted for `[B, ...]` worlds.
+
+    The batch is divided among the devices of the mesh."""
     everywhere, worlds = PartitionSpec(), PartitionSpec("worlds")
     many = jax.shard_map(
         jax.vmap(one, in_axes=(None, 0)),
@@ -76,7 +78,7 @@ class Worlds:
         self._advance: Any = over_worlds(advance, self.mesh)
 
     def compile(self) -> Worlds:
-        """Compile now; else the first chunk does."""
+        """Compile now; otherwise the first chunk does."""
         enable_compilation_cache()
         seeds = jnp.zeros(self.chunk, jnp.int32)
         with ThreadPoolExecutor(1) as pool, no_garbage_collection():

@@ -1,4 +1,4 @@
-"""From the words of an experiment file to a policy, a map, egos and a demand.
+"""From the words of an experiment file to what runs.
 
 What does not fit the map, or names something that is not there, is an `ExperimentError` of one line.
 """
@@ -98,7 +98,7 @@ def _own(name: str, where: str) -> Callable[..., PolicyLike]:
 
 
 def map_of(experiment: ExperimentFile, town: Map | None = None) -> Map:
-    """The map of the file (or this one), with every lane that is named as a goal."""
+    """The map, with every lane that is named as a goal."""
     if town is None:
         try:
             town = load_map(bundled_maps().get(experiment.map, experiment.map))
@@ -232,7 +232,7 @@ def flows_of(experiment: ExperimentFile, town: Map) -> list[Flow]:
 def demand_of(
     experiment: ExperimentFile, town: Map, egos: EgoStart | None, drivers: Population | None = None
 ) -> Demand:
-    """The vehicles of a world, those of the start and those that come later."""
+    """The vehicles of the start and those that come later."""
     traffic = experiment.traffic
     try:
         population = restrict_to_map(population_of(experiment, drivers), town.lanes)
@@ -310,7 +310,9 @@ def describe(value: Any) -> Any:
 
 
 def _own_source(kind: Any) -> str | None:
-    """Hash of the file of a class or function, unless it comes with an installed package."""
+    """Hash of the source file of a class or function.
+
+    None for what comes with an installed package."""
     try:
         path = Path(inspect.getsourcefile(kind) or "")
         if not path.is_file() or path.is_relative_to(_PACKAGE) or "site-packages" in path.parts:

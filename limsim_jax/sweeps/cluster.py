@@ -60,7 +60,7 @@ def sweep_on_ray(
         raise ValueError(f"{workers} workers? at least 1")
     own = not ray.is_initialized()
     if own:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster of ours reports to nobody
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster of ours reports nothing
         local = {"num_cpus": workers, "include_dashboard": False, "object_store_memory": 2**27}
         ray.init(address or "local", log_to_driver=False, **({} if address else local))
     pool = _Pool(factory, workers, {"num_cpus": 1, "max_restarts": 0, **(resources or {})})
@@ -167,7 +167,7 @@ class _Pool:
         self._assign(episodes)
         while any(job.seeds for job in self.jobs.values()) or self.waiting:
             outcome = self._wait()
-            self._assign(episodes)  # before the outcome is written: nobody waits for that
+            self._assign(episodes)  # before the outcome is written: no worker waits for that
             if outcome is not None:
                 yield outcome
 

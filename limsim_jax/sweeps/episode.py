@@ -121,7 +121,7 @@ class Episodes:
 
     @property
     def initial(self) -> int:
-        """Vehicles on the road at the start, egos with a start of their own not counted."""
+        """Vehicles of the traffic on the road at the start."""
         return self._demand.initial
 
     @property
@@ -331,7 +331,9 @@ def _succeeds(
 
 
 def _digest(metrics: Mapping[str, NDArray[np.float64]], state: Any, each: int) -> NDArray[np.uint64]:
-    """A hash of every world's rows and final state, the same for all `each` rows of a world."""
+    """A hash of every world's rows and final state.
+
+    It is the same for all `each` rows of a world."""
     leaves = [np.asarray(x) for x in jax.tree.leaves(state)]
     columns = np.stack([metrics[name] for name in metrics], -1)
     columns = columns.reshape(-1, each, columns.shape[-1])

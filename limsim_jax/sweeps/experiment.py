@@ -64,7 +64,7 @@ class FlowTable(_Table):
 
 
 class TrafficTable(_Table):
-    """Everybody but the ego."""
+    """All vehicles but the egos."""
 
     vehicles: Annotated[int, Field(ge=0)] | None = None
     """On the road at the start, the ego not counted unless its start is random."""
@@ -250,7 +250,7 @@ def _experiment(
 
 
 def with_policy(ego: Any, policy: str, where: str | Path) -> Any:
-    """The table of an ego, or the list of them, with another policy."""
+    """The table or tables of egos with another policy."""
     if isinstance(ego, list):
         return [with_policy(one, policy, where) for one in ego]
     if ego is False:

@@ -24,7 +24,7 @@ from limsim_jax.types import Config, State
 from limsim_jax.xla import enable_compilation_cache, run_once
 
 UNSAFE = 4.0
-"""s before a contact at which somebody may have begun to brake, at most."""
+"""s before a contact at which braking may have begun, at most."""
 
 
 class Replay(NamedTuple):
@@ -75,7 +75,7 @@ class Reruns:
     def explain(
         self, seed: int, ego: int, metrics: dict[str, float], kind: str, seen: Trace
     ) -> dict[str, Any]:
-        """Who and what could have avoided a contact, a place off the road or a crossed red light.
+        """Which vehicle and module could have avoided a failure.
 
         After a contact the world runs twice more, in which the ego, or the other vehicle, brakes as hard as
         it can. Braking starts at the response time of RSS after the first unsafe moment, at most `UNSAFE` s
@@ -107,7 +107,7 @@ class Reruns:
         return found | {"module": " or ".join(blamed) or None}
 
     def _modules(self, seed: int, ego: int, kind: str, start: float, end: float, seen: Trace) -> list[str]:
-        """Modules whose references, in their places from `start` s on, avoid the failure until `end`."""
+        """Modules whose references from `start` s on avoid the failure."""
         every = self.rollout.config.decision_time
         first = int(start / every)
         more = min(math.ceil(end / every), self.rollout.decisions) - first
@@ -129,7 +129,9 @@ class Reruns:
         more: jax.Array,
         box: jax.Array,
     ) -> Any:
-        """Metrics of a world whose policy has a reference module after `first` decisions, for `more`."""
+        """Metrics of a world with a reference in place of a module.
+
+        The reference drives from decision `first` on, for `more` decisions."""
 
         def decisions(run: Rollout, count: jax.Array, carry: Carry) -> Carry:
             def one(_: Any, carry: Carry) -> Carry:
@@ -152,7 +154,7 @@ def of_ego(metrics: dict[str, Any], ego: int) -> dict[str, Any]:
 
 
 class _Braking:
-    """A policy, and a vehicle that brakes as hard as it can from some moment on."""
+    """A policy beside which one vehicle brakes hard."""
 
     def __init__(self, policy: PolicyLike, slot: jax.Array, at: jax.Array) -> None:
         self.free, self.others = policy.free, getattr(policy, "others", 0)

@@ -4,15 +4,15 @@ A sweep may be killed at any moment. Run again, it takes up the worlds that are 
 it adds them; run as shards i/n, at the same time or not, it does a part of the chunks. What is on disk in
 the end is the same in every case, because a world depends on its seed alone.
 
-Stopping early (`until_ci`): whoever looks at an interval often and may stop each time is misled more often
-than its level says. So the sweep looks after `LOOKS_FROM` worlds and at every doubling from there to the last
-seed, and splits the error evenly over these K looks (Bonferroni): each uses the level 1 - 0.05 / K, so that
-with 95 % none of the K intervals misses the truth, wherever the sweep stops. That holds as far as the
-interval keeps its level: Wilson's does on average over shares, the bootstrap's for large samples. The summary
-has this wider interval. A plain 95 % interval of the same worlds, as in tables, is narrower and somewhat
-optimistic, and the estimate is drawn a little towards values with little spread (shares near 0 or 1): a
-sweep stops early when it happens to see few failures. A look counts the first worlds in the order of the
-seeds, whatever else is on disk, so that kills do not move the end.
+Stopping early (`until_ci`): an interval that is looked at often, with the right to stop each time, misleads
+more often than its level says. The sweep looks after `LOOKS_FROM` worlds and at every doubling from there
+to the last seed. It splits the error evenly over these K looks (Bonferroni): each uses the level 1 - 0.05 /
+K. With 95 % none of the K intervals misses the truth, wherever the sweep stops. That holds as far as the
+interval keeps its level: Wilson's does on average over shares, the bootstrap's for large samples. The
+summary has this wider interval. A plain 95 % interval of the same worlds, as in tables, is narrower and
+somewhat optimistic. The estimate is drawn a little towards values with little spread (shares near 0 or 1):
+a sweep stops early when it happens to see few failures. A look counts the first worlds in the order of the
+seeds, whatever else is on disk, so that an interrupted sweep stops at the same place.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def sweep(
         tell, shards = _Teller(one, len(mine), progress), Shards(out, entry)
         jobs.append((one, shards, mine, _missing(shards, mine, tell, damaged), tell))
     with ThreadPoolExecutor(COMPILERS) as pool:
-        # The next scenario compiles while this one runs; but who may stop early may need no more worlds.
+        # The next scenario compiles while this one runs; but one that may stop early may need no more worlds.
         ready = [
             pool.submit(one.compile).result if missing and until_ci is None else one.compile
             for one, _, _, missing, _ in jobs
@@ -396,7 +396,7 @@ class Mismatch(NamedTuple):
 
 
 class VerifyReport(NamedTuple):
-    """What came of running stored worlds again."""
+    """Stored worlds that ran again, and how they differ."""
 
     checked: int  # worlds
     mismatches: tuple[Mismatch, ...]
@@ -409,7 +409,7 @@ class VerifyReport(NamedTuple):
 
 
 def verify(results: Results, episodes: Sequence[Episodes], sample: int = 16, seed: int = 0) -> VerifyReport:
-    """Run a random sample of stored worlds again and compare digests and rows.
+    """Run a random sample of stored worlds again and compare.
 
     Args:
       results: what is stored.

@@ -7,7 +7,7 @@
 `<first>` and `<last>` are the least and the largest seed; a chunk with gaps between has a checksum of its
 seeds behind them. Every file carries its provenance and a SHA-256 of all that it says, so a changed byte is
 found. Any number of processes may write into a directory: a file appears at once under its name, and the
-same chunk has the same content whoever ran it.
+same chunk has the same content in every run.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ KEYS = pa.schema(
 )
 """First columns of the table of episodes; every metric follows as float64, null where not measured."""
 
-_ABANDONED = 3600.0  # s after which an unfinished file belongs to nobody: writing takes milliseconds
+_ABANDONED = 3600.0  # s after which an unfinished file is abandoned: writing takes milliseconds
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -123,7 +123,7 @@ class Entry:
         return f"{self.scenario}/{self.policy}"
 
     def difference(self, other: Mapping[str, Any], ignore: frozenset[str] = NOT_COMPARED) -> str | None:
-        """What another provenance has that this has not, as "chunk is 32 there and 64 here"."""
+        """The first difference, as "chunk is 32 there and 64 here"."""
         here, there = _plain(self.provenance), _plain(other)
         return _difference(
             {k: v for k, v in there.items() if k not in ignore},
@@ -373,7 +373,7 @@ class Shards:
         return path
 
     def chunks(self) -> Iterator[Chunk | DamagedError]:
-        """Finished chunks one after the other, and what is wrong with damaged ones. Every world once.
+        """Finished chunks, and the faults of damaged ones. Every world once.
 
         Raises:
           ResultsError: a file of another provenance; a world that ended in two ways.
@@ -419,7 +419,9 @@ class Shards:
         return {seed: float(np.mean(numbers)) for seed, numbers in found.items()}
 
     def set_aside(self, error: DamagedError) -> None:
-        """Rename a damaged file and its companion, so that their chunk counts as missing."""
+        """Rename a damaged file and its companion.
+
+        Their chunk then counts as missing."""
         stem = error.path.name.split("-", 1)[1]
         for kind in ("episodes", "moments"):  # in this order: a chunk without moments is never finished
             path = self.folder / f"{kind}-{stem}"

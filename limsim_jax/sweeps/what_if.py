@@ -24,7 +24,7 @@ from limsim_jax.xla import enable_compilation_cache, run_once
 
 
 class Stopped(NamedTuple):
-    """A world at some moments, and all that it takes to run on from there."""
+    """A world at some moments, ready to run on."""
 
     run: Rollout
     lane_map: LaneMap
@@ -34,7 +34,7 @@ class Stopped(NamedTuple):
 
 
 def stopped(episodes: Episodes, seed: int, times: Sequence[float]) -> Stopped:
-    """The world of a seed as it was at some times of its episode.
+    """The world of a seed at some times of its episode.
 
     Args:
       episodes: whose world it is.

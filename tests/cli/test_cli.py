@@ -226,7 +226,7 @@ REFUSALS = {
     "weights in no folder": ("train pdm-hybrid --out nowhere/x.npz", "nowhere/x.npz"),
     "bench of no traffic": ("bench traffic none.xodr", "none.xodr"),
     "bench of no worlds": ("bench traffic ok.xodr --worlds 0", "--worlds"),
-    "bench of no policy": ("bench policy ramp --policy nobody", "unknown policy 'nobody'"),
+    "bench of no policy": ("bench policy ramp --policy no_such", "unknown policy 'no_such'"),
     "bench of many policies": ("bench policy paper", "'paper' is 5 experiments"),
     "bench with a bad rate": ("bench traffic ok.xodr --rate -2", "--rate"),
     "bench JSON folder": ("bench traffic ok.xodr --json nowhere/x.json", "nowhere/x.json"),

@@ -87,7 +87,7 @@ def test_totals_add_up_and_nothing_goes_wrong():
         (lambda now: 8.0 * (now < 90), False),
     ],
 )
-def test_who_gets_on_by_less_than_five_metres_in_two_minutes_is_stuck(speed, gridlocked):
+def test_a_vehicle_that_gets_on_by_less_than_five_metres_in_two_minutes_is_stuck(speed, gridlocked):
     """200 s: half of the vehicles drive on, half leave after 100 s, and one does what it is told."""
     config = RUN.config
     before = jax.jit(sampler())(jax.random.key(0)).start

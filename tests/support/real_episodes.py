@@ -8,7 +8,7 @@ from limsim_jax.sweeps.experiment import ExperimentFile
 
 
 class Noted(Episodes):
-    """A few vehicles for a few seconds; tells who runs them."""
+    """A few vehicles for a few seconds; prints which process runs them."""
 
     def __init__(self, note: Path) -> None:
         ego = {"start": "1-", "s": 40.0, "goal": "3+", "policy": "constant_speed"}

@@ -85,7 +85,7 @@ def test_contacts_are_where_bodies_overlap(policy, seed):
 
 def test_both_kinds_of_end_occur():
     contacts = [replayed("constant_speed", seed).metrics["contacts"] for seed in SEEDS]
-    assert max(contacts) > 0, "else the test above tells little"
+    assert max(contacts) > 0, "otherwise the test above tells little"
     assert all(replayed("like_traffic", seed).metrics["contacts"] == 0 for seed in SEEDS)
 
 

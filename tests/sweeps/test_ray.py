@@ -56,7 +56,7 @@ def test_a_worker_that_is_killed_midway_loses_nothing(tmp_path):
         if now.scenario == "flat" and now.done >= 64 and not killed:
             until = time.monotonic() + 10
             while len(jobs(note)) <= now.done // 8 and time.monotonic() < until:
-                time.sleep(0.002)  # until somebody has begun another chunk
+                time.sleep(0.002)  # until a worker has begun another chunk
             killed.append(jobs(note)[-1][0])
             os.kill(killed[0], signal.SIGKILL)
 
@@ -69,7 +69,7 @@ def test_a_worker_that_is_killed_midway_loses_nothing(tmp_path):
     began = jobs(note)
     processes = [process for process, _ in began]
     assert killed and os.getpid() not in processes
-    assert processes[-1] != killed[0] and len(set(processes)) >= 3, "nobody took the place of the dead"
+    assert processes[-1] != killed[0] and len(set(processes)) >= 3, "no worker took the place of the dead"
     assert 60 <= len(began) <= 61, "only the chunk of the dead worker ran again, if it had begun"
 
 
