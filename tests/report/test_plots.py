@@ -82,7 +82,7 @@ def test_pairs_are_the_common_seeds():
     assert (len(passes.get_xdata()), len(hits.get_xdata())) == (30, 5)
     for line in (passes, hits):
         np.testing.assert_allclose(np.asarray(line.get_ydata()) - line.get_xdata(), 1.0)
-    assert equal.get_xdata() == equal.get_ydata()
+    np.testing.assert_array_equal(equal.get_xdata(), equal.get_ydata())
     assert ax.get_title() == "mean difference +1, p < 0.0001"
     with pytest.raises(ValueError, match="no policy 'x' in highway; there are idm, mcts"):
         plots.paired(pair(), "mean_speed", ("idm", "x"))
