@@ -74,6 +74,14 @@ class Comparison(NamedTuple):
     table: pa.Table
     notes: list[str]
 
+    def __str__(self) -> str:
+        return str(comparison_text(self))
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return comparison_text(self)._repr_html_()
+
 
 def compare(
     a: Results,

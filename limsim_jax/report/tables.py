@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -275,6 +276,32 @@ class TextTable(NamedTuple):
         marks = ["---", *["---:"] * (len(self.header) - 1)]
         lines = [" | ".join(cells).join(("| ", " |")) for cells in (self.header, marks, *self.rows)]
         return "\n".join([*lines, "", *(f"{note}  " for note in self.notes)])
+
+    def __str__(self) -> str:
+        rows = [self.header, *self.rows]
+        widths = [max(len(row[k]) for row in rows) for k in range(len(self.header))]
+        lines = [
+            "  ".join(
+                x.rjust(n) if k else x.ljust(n) for k, (x, n) in enumerate(zip(row, widths, strict=True))
+            )
+            for row in rows
+        ]
+        rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
+        return "\n".join([lines[0].rstrip(), rule, *(line.rstrip() for line in lines[1:]), "", *self.notes])
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        def row(cells: Sequence[str], tag: str) -> str:
+            inner = (
+                f'<{tag} style="text-align: {"right" if k else "left"}">{escape(x)}</{tag}>'
+                for k, x in enumerate(cells)
+            )
+            return f"<tr>{''.join(inner)}</tr>"
+
+        head, body = row(self.header, "th"), "".join(row(cells, "td") for cells in self.rows)
+        notes = "".join(f"<div>{escape(note)}</div>" for note in self.notes)
+        return f"<table><thead>{head}</thead><tbody>{body}</tbody></table>{notes}"
 
 
 def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = None) -> TextTable:

@@ -202,3 +202,18 @@ def test_notebooks_show_a_table():
         "first note  ",
         "second  ",
     ]
+
+
+def test_tables_print_in_columns_and_show_as_html():
+    table = tables.TextTable(["", "a < b"], [["seeds", "10"], ["success, %", "100"]], ["a note"])
+    assert str(table).splitlines() == [
+        "            a < b",
+        "-----------------",
+        "seeds          10",
+        "success, %    100",
+        "",
+        "a note",
+    ]
+    assert repr(table) == str(table)
+    html = table._repr_html_()
+    assert "<th" in html and "a &lt; b" in html and html.endswith("<div>a note</div>")
