@@ -1,6 +1,4 @@
-"""Tables of the parameters of vehicles, drivers and behaviour.
-
-With units and sources.
+"""Tables of the parameters of vehicles, drivers and their behaviour, with units and sources.
 
     python experiments/vehicle_table.py
 

@@ -1,4 +1,4 @@
-"""Futures: a world that is stopped at a moment, from which several worlds go on."""
+"""Futures: a world that is stopped at some moments, from which several worlds go on."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 
 class Futures(Sequence[World]):
-    """Worlds that go on from one moment.
+    """Worlds that go on from one moment or from several.
 
     Attributes:
-      worlds: policy by policy, copy by copy.
-      at: s, the moment.
+      worlds: policy by policy, moment by moment, copy by copy.
+      at: s, the moment of each world.
     """
 
-    def __init__(self, worlds: Sequence[World], at: float) -> None:
-        self.worlds, self.at = list(worlds), at
+    def __init__(self, worlds: Sequence[World], at: Sequence[float]) -> None:
+        self.worlds, self.at = list(worlds), list(at)
 
     def __len__(self) -> int:
         return len(self.worlds)
@@ -46,20 +46,22 @@ class Futures(Sequence[World]):
         return iter(self.worlds)
 
     def table(self) -> pa.Table:
-        """A row per future: policy, copy, and every metric from the fork on."""
+        """A row per future: policy, moment (s), copy, and every metric from the fork on."""
         names = list(self.worlds[0].metrics)
-        count: dict[str, int] = {}
+        count: dict[tuple[str, float], int] = {}
         rows = []
-        for world in self.worlds:
-            copy = count[world.policy] = count.get(world.policy, -1) + 1
-            rows.append({"policy": world.policy, "copy": copy} | {n: world.metrics[n] for n in names})
+        for world, at in zip(self.worlds, self.at, strict=True):
+            copy = count[world.policy, at] = count.get((world.policy, at), -1) + 1
+            rows.append({"policy": world.policy, "at": at, "copy": copy})
+            rows[-1] |= {name: world.metrics[name] for name in names}
         return pa.Table.from_pylist(rows)
 
     def trajectories(self) -> pa.Table:
         """All vehicles of all futures in one long table.
 
-        Columns `policy` and `copy` come first."""
-        keys = self.table().select(["policy", "copy"]).to_pylist()
+        Columns `policy`, `at` and `copy` come first.
+        """
+        keys = self.table().select(["policy", "at", "copy"]).to_pylist()
         parts = []
         for key, world in zip(keys, self.worlds, strict=True):
             part = world.trajectories()
@@ -70,12 +72,13 @@ class Futures(Sequence[World]):
 
     def __repr__(self) -> str:
         names = ", ".join(dict.fromkeys(world.policy for world in self.worlds))
-        return f"{len(self)} futures from {self.at:g} s on ({names})"
+        times = ", ".join(f"{at:g}" for at in dict.fromkeys(self.at))
+        return f"{len(self)} futures from {times} s on ({names})"
 
 
 def run_futures(
     world: World,
-    at: float,
+    at: float | Sequence[float],
     policies: Sequence[PolicyLike | str | None],
     count: int,
     change: Callable[[State, Any], State] | None,
@@ -86,39 +89,44 @@ def run_futures(
         raise ValueError("count: at least one copy of at least one policy is needed")
     episodes = world.episodes
     assert episodes is not None
-    now = stopped(episodes, world.seed, [at])
-    state, memory = jax.tree.map(lambda x: x[0], (now.carry.state, now.carry.memory))
+    moments = np.atleast_1d(np.asarray(at, float))
+    now = stopped(episodes, world.seed, moments.tolist())
     every = now.run.config.decision_time
-    begin = round(at / every)
-    left = now.run.decisions - begin
+    begin = np.round(moments / every)
+    left = now.run.decisions - int(begin.max())
     decisions = left if seconds is None else min(left, max(1, round(seconds / every)))
     if decisions < 1:
-        raise ValueError(f"at: {at:g} s; nothing is left of {now.run.horizon:g} s")
+        raise ValueError(f"at: {moments.max():g} s; nothing is left of {now.run.horizon:g} s")
     found = []
     for policy in policies:
         same, driver, name = _driver(episodes, policy)
         run = replace(now.run, policy=driver, record=trace)
 
-        def one(k: Any, run: Any = run, same: bool = same) -> Any:
+        def one(state: State, memory: Any, k: Any, run: Any = run, same: bool = same) -> Any:
             changed = state if change is None else change(state, k)
             kept = memory if same else run.policy.init(run.config, now.lane_map, changed)
             carry = run.restart(now.lane_map, changed, kept)
             return run.advance(now.lane_map, now.schedule, now.key, carry, decisions)[0]
 
-        result = jax.device_get(jax.jit(jax.vmap(one))(jnp.arange(count)))
-        columns = of_ego(on_host(result.measures), max(world.ego, 0))
-        for k in range(count):
+        copies = jax.vmap(one, (None, None, 0))
+        batch = jax.vmap(copies, (0, 0, None))
+        result = jax.device_get(jax.jit(batch)(now.carry.state, now.carry.memory, jnp.arange(count)))
+        kept = jax.tree.map(
+            lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), (result.trace, result.measures)
+        )
+        columns = of_ego(on_host(kept[1]), max(world.ego, 0))
+        for k in range(len(moments) * count):
             found.append(
                 replace(
                     world,
                     policy=name,
-                    trace=jax.tree.map(lambda x: x[k], result.trace),  # noqa: B023
+                    trace=jax.tree.map(lambda x: x[k], kept[0]),  # noqa: B023
                     metrics={metric: float(np.asarray(x)[k]) for metric, x in columns.items()},
                     moments=[],
                     episodes=None,
                 )
             )
-    return Futures(found, begin * every)
+    return Futures(found, np.tile(np.repeat(begin * every, count), len(policies)).tolist())
 
 
 def _driver(episodes: Episodes, policy: PolicyLike | str | None) -> tuple[bool, PolicyLike, str]:

@@ -133,24 +133,25 @@ class World:
 
     def fork(
         self,
-        at: float,
+        at: float | Sequence[float],
         *,
         policies: Sequence[PolicyLike | str | None] = (None,),
         count: int = 1,
         change: Callable[[State, Any], State] | None = None,
         seconds: float | None = None,
     ) -> Futures:
-        """Stop the world at a moment and run on from there.
+        """Run on from one moment of the world, or from several.
 
         Args:
           at: s, rounded to whole decisions.
           policies: what drives the egos from then on, each a future or `count` of them; None: as before.
           count: copies per policy.
           change: `change(state, k)` returns the state from which copy `k` goes on. It is traced by JAX.
-          seconds: how long they run; None: to the horizon.
+          seconds: how long they run; None: as long as the horizon leaves to all of them.
 
         Returns:
-          All futures, policy by policy: a sequence of `World`s whose metrics count from the fork on.
+          All futures, policy by policy, moment by moment, copy by copy: a sequence of `World`s whose
+          metrics count from the fork on.
         """
         from limsim_jax.api.futures import run_futures
 

@@ -74,13 +74,17 @@ class Comparison(NamedTuple):
     table: pa.Table
     notes: list[str]
 
+    def text(self, k: int = 25) -> TextTable:
+        """Its first `k` rows as a table to print."""
+        return comparison_text(self, k)
+
     def __str__(self) -> str:
-        return str(comparison_text(self))
+        return str(self.text())
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return comparison_text(self)._repr_html_()
+        return self.text()._repr_html_()
 
 
 def compare(

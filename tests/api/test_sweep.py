@@ -75,6 +75,8 @@ def test_comparison_pairs_seeds_and_egos(results):
     assert "pair" in str(row["scenario"])
     with pytest.raises(ValueError, match="no policy 'fast'; there are constant_speed, slow"):
         results.compare("constant_speed", "fast")
+    assert str(found).startswith("metric ") and "<table>" in found._repr_html_()
+    assert len(found.text(k=3).rows) == 3
 
 
 def test_worst_rows_are_replayed(results):
@@ -123,6 +125,21 @@ def test_a_world_is_forked(results):
     np.testing.assert_allclose(seen.box[4, 0, :2], world.trace.box[then + 5, 0, :2], atol=0.05)
     with pytest.raises(ValueError, match="nothing is left"):
         world.fork(at=6.0)
+
+
+def test_a_world_is_forked_at_several_moments(results):
+    world = results.replay(1, policy="slow")
+
+    def faster(state, k):
+        return state.replace(v=state.v.at[state.egos.slot].set(4.0 + k))
+
+    kept = lj.ConstantSpeed()  # the speed of the moment
+    futures = world.fork(at=[1.0, 3.0], policies=[kept], count=2, change=faster, seconds=1.0)
+    rows = futures.table().to_pylist()
+    assert [(row["at"], row["copy"]) for row in rows] == [(1.0, 0), (1.0, 1), (3.0, 0), (3.0, 1)]
+    np.testing.assert_allclose([row["mean_speed"] for row in rows], [4, 5, 4, 5], atol=0.3)
+    np.testing.assert_allclose([future.trace.time[0] for future in futures], [1.1, 1.1, 3.1, 3.1], atol=1e-4)
+    assert str(futures) == "4 futures from 1, 3 s on (constant_speed)"
 
 
 def test_plain_traffic_is_swept():
