@@ -229,7 +229,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def check_maps(parser: argparse.ArgumentParser, names: list[str]) -> None:
-    """End the program if a name is no file and no bundled map."""
+    """End the program if a name is neither file nor bundled map."""
     for name in names:
         if not Path(name).exists() and name not in bundled_maps():
             parser.error(f"--map {name}: no such file, nor one of {', '.join(bundled_maps())}")

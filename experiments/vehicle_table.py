@@ -1,4 +1,6 @@
-"""Tables of the parameters of vehicles, drivers and their behaviour, with units and sources.
+"""Tables of the parameters of vehicles, drivers and behaviour.
+
+With units and sources.
 
     python experiments/vehicle_table.py
 

@@ -24,7 +24,7 @@ from jaxtyping import install_import_hook  # noqa: E402
 _hooked = ["limsim_jax.numerics", "limsim_jax.geometry"]
 _hooked += [f"limsim_jax.maps.{name}" for name in ("outline", "rasterise", "routing", "signals")]
 _hooked += [f"limsim_jax.maps.conflicts.{name}" for name in ("build", "overlaps", "priority", "waiting")]
-_traffic = "car_following", "collision", "lane_change", "motion", "neighbors", "signals", "speeds", "state"
+_traffic = "car_following", "collision", "lane_change", "motion", "neighbors", "signals", "speeds"
 _hooked += [f"limsim_jax.traffic.{name}" for name in _traffic]
 _demand = "build", "departures", "flows", "sample", "seats", "sumo", "tables"
 _hooked += [f"limsim_jax.traffic.demand.{name}" for name in _demand]

@@ -413,7 +413,7 @@ def population_content(
     ]
     if not names:
         raise ValueError(
-            f"the data of {len(law.drivers)} drivers tell none of {', '.join(PARAMETERS)}; longer records, "
+            f"the data of {len(law.drivers)} driver(s) tell none of {', '.join(PARAMETERS)}; longer records, "
             "with free driving, approaches and stops, are needed"
         )
     at = [PARAMETERS.index(name) for name in names]

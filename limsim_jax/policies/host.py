@@ -188,7 +188,7 @@ def _empty_road(seen: Any) -> Any:
 
 
 def command_from(kind: Kind, found: Mapping[str, Any], config: Config, state: State, dt: float) -> Command:
-    """The command of arrays by name, as a host function or an environment's caller gives them.
+    """The command of named arrays, from a host function or an `Env`.
 
     Args:
       kind: what they are.

@@ -12,7 +12,7 @@ from limsim_jax.maps.lane_map import LaneMap, pose
 from limsim_jax.policies.base import Policy
 from limsim_jax.policies.perception import rules
 from limsim_jax.policies.reference import center_lane, path_from
-from limsim_jax.traffic.ego import Control
+from limsim_jax.traffic.ego import Control, Trajectory
 from limsim_jax.traffic.engine import Command, Traffic
 from limsim_jax.traffic.motion import accelerations
 from limsim_jax.types import Config, State
@@ -107,5 +107,8 @@ class FollowLane(Policy):
         stops = jnp.where(a < 0, v0 / jnp.maximum(-a, 1e-3), 1e3)
         t = jnp.minimum(times, stops)
         along = v0 * t + a * t * t / 2
-        now, d = config.time(state.step), d0 * jnp.exp(-along / 10.0)
-        return Command(trajectory=path.trajectory(along, v0 + a * t, now, 0.2, d)), memory
+        place = path.at(along, d0 * jnp.exp(-along / 10.0))
+        trajectory = Trajectory(
+            x=place.x, y=place.y, heading=place.heading, v=v0 + a * t, t0=config.time(state.step), dt=0.2
+        )
+        return Command(trajectory=trajectory), memory

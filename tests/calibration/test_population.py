@@ -49,9 +49,9 @@ def law(residual=None):
     return Law(
         mean=np.log(TYPICAL),
         covariance=COVARIANCE,
-        drivers=("a", "b"),
-        posterior_mean=rng.multivariate_normal(np.log(TYPICAL), COVARIANCE, 2),
-        posterior_covariance=np.tile(COVARIANCE / 100, (2, 1, 1)),
+        drivers=("a", "b", "c"),
+        posterior_mean=rng.multivariate_normal(np.log(TYPICAL), COVARIANCE, 3),
+        posterior_covariance=np.tile(COVARIANCE / 100, (3, 1, 1)),
         identified=np.array([0.9, 0.8, 0.7, 0.6, 0.2]),
         model=MODELS["idm"],
         objective="gap",
@@ -153,6 +153,11 @@ def test_v0_is_written_only_where_data_tell_it(tmp_path):
     assert "v_max" in json.loads(path.read_text())["parameters"]
     write_population(replace(law(), identified=np.full(5, 0.4)), path)
     assert list(json.loads(path.read_text())["parameters"]) == ["T", "s0", "a", "b"]
+    # of one or two drivers any parameter
+    write_population(replace(law(), drivers=("a", "b")), path)
+    assert list(json.loads(path.read_text())["parameters"]) == ["v_max", "T", "s0", "a"]
+    with pytest.raises(ValueError, match=r"the data of 1 driver\(s\) tell none of v0, T"):
+        write_population(replace(law(), drivers=("a",), identified=np.zeros(5)), path)
 
 
 @pytest.mark.parametrize(

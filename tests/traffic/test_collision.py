@@ -143,7 +143,7 @@ def row_on(name, index=0):
     return rows[index]
 
 
-def test_contacts_are_recorded_once_and_nobody_is_removed():
+def test_contacts_are_recorded_once_and_no_vehicle_is_removed():
     _, lane_map = bundled("intersection")
     row = row_on("intersection")
     # 0 and 1 overlap by 1 m, 2 is clear of them, 3 stands on 0 but is not there, 4 is broken

@@ -149,7 +149,7 @@ def test_a_follower_two_lanes_back_is_seen():
     assert int(neighbors(CONFIG, lane_map, order, state, *query).lag[0, 0]) == -1, "without their ways"
 
 
-def test_nobody_sees_empty_slots_or_itself():
+def test_no_vehicle_sees_empty_slots_or_itself():
     _, lane_map = bundled("highway")
     goal = int(np.nonzero(np.asarray(lane_map.routes.reachable)[0])[0][0])
     state = state_of(

@@ -307,10 +307,10 @@ def test_a_vehicle_at_its_goal_does_not_run_into_one_that_has_just_left():
 def test_fixed_programs_follow_the_clock():
     _, lane_map = bundled("intersection")
     state = state_of("intersection", [0], [5.0], [5.0], [0])
-    nobody = jnp.full((1, 1), -1)
+    none = jnp.full((1, 1), -1)
     for step in (0, 100, 345, 1111):
         lights = switch(
-            CONFIG, lane_map, dataclasses.replace(state, step=jnp.int32(step)), nobody, 0.0 * nobody
+            CONFIG, lane_map, dataclasses.replace(state, step=jnp.int32(step)), none, 0.0 * none
         )
         np.testing.assert_array_equal(lights.phase, phase_at(lane_map.signals, step * 0.1))
 
@@ -318,10 +318,10 @@ def test_fixed_programs_follow_the_clock():
 def test_lights_know_how_long_they_have_shown_what_they_show():
     _, lane_map = bundled("intersection")
     state = state_of("intersection", [0], [5.0], [5.0], [0])
-    jitted, nobody = jax.jit(functools.partial(switch, CONFIG, lane_map)), jnp.full((1, 1), -1)
+    jitted, none = jax.jit(functools.partial(switch, CONFIG, lane_map)), jnp.full((1, 1), -1)
     since, before, longest = np.zeros(state.lights.phase.shape), np.asarray(state.lights.phase), 0
     for k in range(300):
-        lights = jitted(dataclasses.replace(state, step=jnp.int32(5 * k)), nobody, 0.0 * nobody)
+        lights = jitted(dataclasses.replace(state, step=jnp.int32(5 * k)), none, 0.0 * none)
         phase = np.asarray(lights.phase)
         since = np.where((phase != before) | (k == 0), 0, since + 0.5)
         np.testing.assert_allclose(lights.elapsed, since)

@@ -55,7 +55,7 @@ def test_discharge_counts_from_the_fourth_of_the_queue():
     assert first == pytest.approx([2.0, 1.0])
 
 
-def test_a_green_counts_if_it_is_for_all_and_nobody_has_to_yield():
+def test_a_green_counts_if_it_is_for_all_and_none_has_to_yield():
     light = referee.Light("program", links=(0, 2), foes=(3,))
     assert referee.is_free(light, "Grgr")
     assert not referee.is_free(light, "GrgG")  # a foe goes, too
