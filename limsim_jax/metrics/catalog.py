@@ -7,7 +7,9 @@ come from here. Each built-in metric is described beside its computation, in `me
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from typing import Any
 
 from limsim_jax.metrics import ego, traffic
 from limsim_jax.metrics.description import Better, Description, Headline, Kind
@@ -113,8 +115,10 @@ def describe(name: str, meaning: str = "") -> Description:
         kind = "proportion"
     elif meaning.startswith(("blame.", "slot")):
         kind = "label"
+    told = re.search(r"; (higher|lower) is better$", meaning)
+    better: Any = told[1] if told else "neither"
     section = "Traffic" if name.startswith("traffic_") else "Own metrics"
-    return Description(name, meaning, section, kind=kind)
+    return Description(name, meaning, section, better, kind)
 
 
 def headlines() -> tuple[Description, ...]:

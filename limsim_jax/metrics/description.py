@@ -35,6 +35,13 @@ class Headline(NamedTuple):
     scale: float = 1.0
 
 
+class Plot(NamedTuple):
+    """The distribution of a metric in a report."""
+
+    label: str
+    unit: str
+
+
 @dataclass(frozen=True)
 class Description:
     """One column of results.
@@ -49,7 +56,7 @@ class Description:
       source: where the definition comes from; empty where it is this package's own.
       missing: when an episode has no value, besides an ego that was never on the road.
       headline: its row in the short list, or None.
-      plot: title of its distribution in the report; empty for none.
+      plot: its distribution in the report, or None.
       of: the column that a derived metric follows from; empty for columns.
     """
 
@@ -62,7 +69,7 @@ class Description:
     source: str = ""
     missing: str = ""
     headline: Headline | None = None
-    plot: str = ""
+    plot: Plot | None = None
     of: str = ""
 
     @property

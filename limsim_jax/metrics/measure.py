@@ -71,10 +71,11 @@ class Metric:
 
     @property
     def description(self) -> Description:
-        """What the column is, for tables and reports."""
+        """What the column is, for tables and reports. Its meaning tells which values are better."""
+        direction = "" if self.better == "neither" else f"; {self.better} is better"
         return Description(
             self.name,
-            self.unit,
+            self.unit + direction,
             "Own metrics",
             self.better,
             "proportion" if self.unit.startswith("1 if") else "mean",

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.metrics.description import Better, Description
+from limsim_jax.metrics.description import Better, Description, Plot
 from limsim_jax.metrics.reductions import Least, Mean, Measured, measured
 from limsim_jax.numerics import safe_divide, safe_sqrt
 
@@ -48,7 +48,7 @@ def _column(
     missing: str = "",
     *,
     source: str = "",
-    plot: str = "",
+    plot: Plot | None = None,
 ) -> Description:
     name = f"traffic_{name}"
     return Description(
@@ -63,7 +63,7 @@ _NO_TRIP = "No vehicle reached its goal."
 DESCRIPTIONS = (
     _column(
         "mean_speed", "m/s, distance travelled by time spent", "higher", "Distance travelled / time spent.",
-        "No vehicle was there.", source=_EDIE, plot="Mean speed of the traffic, m/s",
+        "No vehicle was there.", source=_EDIE, plot=Plot("Mean speed of the traffic", "m/s"),
     ),
     _column(
         "flow_per_hour", "vehicles per hour and lane", "higher",

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
+from limsim_jax.metrics.catalog import describe
 from limsim_jax.report.formats import number, number_text, p_text
 from limsim_jax.report.tables import (
     COMPARED,
@@ -23,7 +24,6 @@ from limsim_jax.report.tables import (
     better,
     columns,
     groups,
-    kind_of,
     metrics_of,
     null,
     with_shares,
@@ -119,7 +119,7 @@ def compare(
         notes += said
     for row, p in zip(rows, holm([row["p"] for row in rows]), strict=True):
         row["p_adjusted"] = p
-        sign = better(row["metric"]) * float(np.sign(row["difference"]))
+        sign = better(row["metric"], row["meaning"]) * float(np.sign(row["difference"]))
         row["better"] = {1: "B", -1: "A"}.get(int(sign)) if p <= 1 - level else None
     first_rows = {metric: place for place, metric in enumerate(COMPARED)}
     rows.sort(key=lambda row: (first_rows.get(row["metric"], len(COMPARED)), row["p"], -row.pop("strength")))
@@ -250,7 +250,7 @@ def _compared(
     if same:
         notes.append(f"{where}; in {same:,} of them the two episodes are the same, bit by bit")
     common = [name for name in metrics_of(part_a) if name in part_b.column_names]
-    names = [name for name in common if kind_of(units.get(name, "")) != "label"]
+    names = [name for name in common if describe(name, units.get(name, "")).kind != "label"]
     x, y = columns(part_a, names)[at_a], columns(part_b, names)[at_b]
     intervals = mean_intervals(y - x, level=level)
     rows = []
@@ -261,7 +261,7 @@ def _compared(
             continue
         own, other = x[both, k], y[both, k]
         meaning = units.get(name, "")
-        proportion = kind_of(meaning) == "proportion" and np.isin((own, other), (0, 1)).all()
+        proportion = describe(name, meaning).kind == "proportion" and np.isin((own, other), (0, 1)).all()
         row: dict[str, Any] = dict(scenario=first[0], policy_a=first[1], policy_b=second[1], metric=name)
         row |= dict(meaning=meaning, kind="proportion" if proportion else "mean", pairs=own.size)
         row |= dict(measured_a_only=int((in_a & ~in_b).sum()), measured_b_only=int((in_b & ~in_a).sum()))

@@ -14,8 +14,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
+from limsim_jax.metrics.catalog import describe
 from limsim_jax.metrics.moments import ORDER, words
-from limsim_jax.report.tables import columns, groups, kind_of, metrics_of, with_shares
+from limsim_jax.report.tables import columns, groups, metrics_of, with_shares
 from limsim_jax.statistics import median_interval, paired_t, wilson
 
 if TYPE_CHECKING:
@@ -340,4 +341,4 @@ def _label(results: Results, metric: str) -> str:
     meaning = _stored(results).units.get(metric, "")
     first = meaning.replace(",", ";").partition(";")[0].strip()
     name = metric.replace("_", " ")
-    return f"{name}, {first}" if kind_of(meaning) == "mean" and 0 < len(first) <= 8 else name
+    return f"{name}, {first}" if describe(metric, meaning).kind == "mean" and 0 < len(first) <= 8 else name

@@ -21,6 +21,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from limsim_jax.metrics.blame import Responsibility
+from limsim_jax.metrics.catalog import DERIVED, describe, headlines
+from limsim_jax.metrics.description import Kind
 from limsim_jax.report.formats import estimate_text
 from limsim_jax.statistics import (
     check_level,
@@ -35,28 +37,19 @@ if TYPE_CHECKING:
     from limsim_jax.sweeps.store import Results
 
 Floats = NDArray[np.float64]
-Kind = Literal["proportion", "mean", "label", "rate"]
 Group = tuple[str, str]
 """Scenario and policy."""
 
-KEYS = ("scenario", "policy", "seed", "digest")
+KEYS = ("scenario", "policy", "seed", "ego", "digest")
 """Columns of episodes that are no metrics."""
 
 CRASH_RATE = "crashes_per_1000_km"
 AT_FAULT_RATE = "at_fault_crashes_per_1000_km"
 
-# Shares that follow from metrics: an episode counts once, however many bodies it touched.
-_SHARES = {
-    "had_contact": ("contacts", "1 if the ego touched another body"),
-    "had_at_fault_contact": ("at_fault_contacts", "1 if it did by its own fault by nuPlan's rules"),
-    "had_near_miss": ("near_misses", "1 if the TTC fell below 1.5 s and no contact came of it"),
-    "left_road": ("off_road", "1 if the ego was off the drivable area"),
-    "ran_red_light": ("red_lights", "1 if the ego crossed a stop line on red"),
-}
-RATES = {
-    CRASH_RATE: ("contacts", "episodes with a contact, per 1,000 km that the ego drove"),
-    AT_FAULT_RATE: ("at_fault_contacts", "those by the ego's fault by nuPlan's rules, per 1,000 km"),
-}
+_SHARES = {x.name: (x.of, x.meaning) for x in DERIVED if x.kind == "proportion"}
+"""Shares that follow from metrics: an episode counts once, however many bodies it touched."""
+
+RATES = {x.name: (x.of, x.meaning) for x in DERIVED if x.kind == "rate"}
 """Rates per distance: the metric that counts the events, and the meaning."""
 
 
@@ -70,22 +63,7 @@ class Main(NamedTuple):
     scale: float = 1.0
 
 
-MAIN = (
-    Main("success", "success", unit="%", scale=100),
-    Main("completion", "route completed", unit="%", scale=100),
-    Main("had_contact", "episodes with a contact", unit="%", scale=100),
-    Main("had_at_fault_contact", "contacts at fault (nuPlan)", unit="%", scale=100),
-    Main(CRASH_RATE, "crashes per 1,000 km"),
-    Main("had_near_miss", "episodes with a near miss", unit="%", scale=100),
-    Main("left_road", "episodes off the road", unit="%", scale=100),
-    Main("ran_red_light", "episodes with a red light run", unit="%", scale=100),
-    Main("min_ttc", "least TTC, median", "median", "s"),
-    Main("nuplan_score", "nuPlan score", unit="of 1"),
-    Main("carla_score", "CARLA score", unit="of 100"),
-    Main("limsim_corrected_total", "LimSim score, corrected", unit="of 100"),
-    Main("mean_speed", "mean speed", unit="m/s"),
-    Main("traffic_collided", "vehicles that collided, per episode"),
-)
+MAIN = tuple(Main(x.name, *x.headline[1:]) for x in headlines() if x.headline)
 """The short list, in order."""
 
 COMPARED = (
@@ -141,32 +119,13 @@ def with_shares(episodes: pa.Table, units: Mapping[str, str]) -> tuple[pa.Table,
     return episodes, units
 
 
-def kind_of(meaning: str) -> Kind:
-    """What the description of a metric says that it is."""
-    if meaning.startswith(("1 if", "0 or 1")):
-        return "proportion"
-    if meaning.startswith(("blame.", "slot")):
-        return "label"
-    return "mean"
+def better(metric: str, meaning: str = "") -> int:
+    """1: more is better, -1: less is better, 0: neither.
 
+    `meaning`: of an own metric, as results keep it.
+    """
+    return describe(metric, meaning).sign
 
-def better(metric: str) -> int:
-    """1: more is better, -1: less is better, 0: neither."""
-    if metric.startswith("min_") and not metric.endswith("_time"):
-        return 1
-    if metric.startswith(("nuplan_", "carla_", "limsim_")):
-        return 1
-    if metric in _GOOD:
-        return 1
-    when = metric.endswith("_time") and metric not in ("completion_time", "traffic_mean_travel_time")
-    return 0 if when or metric in _NEUTRAL else -1
-
-
-_GOOD = {"arrived", "success", "completion", "progress", "mean_speed", "comfortable",
-         "traffic_mean_speed", "traffic_flow_per_hour", "traffic_left"}  # fmt: skip
-_NEUTRAL = {"duration", "distance", "contact_other", "contact_type", "contact_responsibility",
-            "max_acceleration", "traffic_entered", "traffic_distance", "traffic_vehicle_km",
-            "traffic_density_per_km", "traffic_trips", "traffic_time"}  # fmt: skip
 
 _SCHEMA = pa.schema(
     [
@@ -201,9 +160,9 @@ def summary(results: Results, *, level: float = 0.95) -> pa.Table:
     rows: list[dict[str, Any]] = []
     for (scenario, policy), part in groups(results).items():
         part, units = with_shares(part, results.units)
-        names = [name for name in metrics_of(part) if kind_of(units.get(name, "")) != "label"]
+        names = [name for name in metrics_of(part) if describe(name, units.get(name, "")).kind != "label"]
         values = columns(part, names)
-        kinds = [_kind(units.get(name, ""), values[:, k]) for k, name in enumerate(names)]
+        kinds = [_kind(name, units.get(name, ""), values[:, k]) for k, name in enumerate(names)]
         means = [k for k, kind in enumerate(kinds) if kind == "mean"]
         intervals = dict(zip(means, mean_intervals(values[:, means], level=level), strict=True))
         for k, (name, kind) in enumerate(zip(names, kinds, strict=True)):
@@ -226,8 +185,8 @@ def summary(results: Results, *, level: float = 0.95) -> pa.Table:
     return pa.Table.from_pylist(clean, _SCHEMA)
 
 
-def _kind(meaning: str, x: Floats) -> Kind:
-    kind = kind_of(meaning)
+def _kind(name: str, meaning: str, x: Floats) -> Kind:
+    kind = describe(name, meaning).kind
     fits = np.isin(x[~np.isnan(x)], (0.0, 1.0)).all()
     return "mean" if kind == "proportion" and not fits else kind
 
@@ -386,11 +345,13 @@ def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
     Raises `ValueError` for an unknown metric, or one of which neither more nor less is worse.
     """
     table, _ = with_shares(results.episodes, results.units)
+    sign = 0
     if metric is not None:
         known = metrics_of(table)
         if metric not in known:
             raise ValueError(f"no metric '{metric}' in {results.path}; there are {', '.join(known)}")
-        if not better(metric):
+        sign = better(metric, results.units.get(metric, ""))
+        if not sign:
             raise ValueError(f"neither more nor less of '{metric}' is worse; name another metric")
     view = _severity(table)
     seeds = table["seed"].to_numpy()
@@ -399,7 +360,7 @@ def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
         order = np.lexsort((seeds, view["min_ttc"], -view["failed"], -view["left_road"], -view["delta_v"],
                             -view["at_fault"], -view["contact"]))  # fmt: skip
     else:
-        order = np.lexsort((seeds, better(metric) * ranked))
+        order = np.lexsort((seeds, sign * ranked))
         order = order[~np.isnan(ranked[order])]
     order = order[: max(k, 0)]
     chosen = table.select(["scenario", "policy", "seed"]).take(order).to_pylist()

@@ -7,6 +7,7 @@ import pytest
 from limsim_jax.metrics.catalog import DERIVED, EGO, TOTALS, TRAFFIC, catalog, describe, headlines
 from limsim_jax.metrics.description import SECTIONS, Description
 from limsim_jax.metrics.ego import NAMES
+from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.observer import EvaluateEgo, EvaluateTraffic
 from limsim_jax.metrics.traffic import NAMES as TRAFFIC_NAMES
 from limsim_jax.simulation.rollout import Totals
@@ -77,3 +78,12 @@ def test_unknown_names_are_described_by_their_meaning():
     )
     assert describe("traffic_trams", "trams").section == "Traffic"
     assert describe("first_slot", "slot of the first").kind == "label"
+
+
+def test_results_on_disk_tell_which_values_of_an_own_metric_are_better():
+    class Late(Metric):
+        name, unit, better = "late", "1 if it was late", "lower"
+
+    column = Late().description
+    assert column.meaning == "1 if it was late; lower is better"
+    assert describe(column.name, column.meaning) == column

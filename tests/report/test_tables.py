@@ -8,6 +8,7 @@ import pytest
 from fake_results import NAN, ONE, UNITS, crashes, made
 from pyarrow.csv import read_csv
 
+from limsim_jax.metrics.catalog import describe
 from limsim_jax.report import tables
 from limsim_jax.report.tables import headline, lookup, summary, worst, write_csv
 from limsim_jax.statistics import bootstrap, wilson
@@ -90,7 +91,7 @@ def test_a_share_that_is_no_share_is_a_mean():
 def test_labels_are_not_averaged():
     rows = rows_of(made({ONE: {"contact_other": [3, 8], "contact_type": [1, 5], "contacts": [1, 1]}}))
     assert not {"contact_other", "contact_type", "seed", "digest"} & set(rows)
-    labels = {name for name, meaning in UNITS.items() if tables.kind_of(meaning) == "label"}
+    labels = {name for name, meaning in UNITS.items() if describe(name, meaning).kind == "label"}
     assert labels == {"contact_other", "contact_type", "contact_responsibility"}
 
 

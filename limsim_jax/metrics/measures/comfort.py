@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from limsim_jax.metrics.description import Better, Description
+from limsim_jax.metrics.description import Better, Description, Plot
 from limsim_jax.metrics.measure import Derived, Measure, Summary
 from limsim_jax.metrics.motion import Filtered, MotionCarry, motion_init, motion_result, motion_update
 from limsim_jax.metrics.reductions import Measured
@@ -14,7 +14,7 @@ _SOURCE = "nuplan-devkit, state_extractors.py"
 _SHORT = "The episode is shorter than the filter (about two seconds for jerk)."
 
 
-def _column(name: str, meaning: str, better: Better, formula: str, plot: str = "") -> Description:
+def _column(name: str, meaning: str, better: Better, formula: str, plot: Plot | None = None) -> Description:
     return Description(
         name, meaning, "Comfort", better, formula=formula, source=_SOURCE, missing=_SHORT, plot=plot
     )
@@ -35,7 +35,7 @@ class Comfort(Measure):
         _column(
             "min_acceleration", "m/s^2, hardest braking, filtered", "higher",
             "Least acceleration along the heading, after a Savitzky-Golay filter (window 0.8 s, order 2).",
-            "Hardest braking, m/s²",
+            Plot("Hardest braking", "m/s²"),
         ),
         _column(
             "max_acceleration", "m/s^2, filtered", "neither",
@@ -44,12 +44,12 @@ class Comfort(Measure):
         _column(
             "max_lateral_acceleration", "m/s^2, absolute, filtered", "lower",
             "Greatest |v x yaw rate|, filtered as min_acceleration.",
-            "Highest lateral acceleration, m/s²",
+            Plot("Highest lateral acceleration", "m/s²"),
         ),
         _column(
             "max_jerk", "m/s^3, absolute, of the magnitude of the acceleration, filtered", "lower",
             "Greatest |derivative| (window 1.5 s, order 2) of the filtered magnitude of the acceleration.",
-            "Highest jerk, m/s³",
+            Plot("Highest jerk", "m/s³"),
         ),
         _column(
             "max_longitudinal_jerk", "m/s^3, absolute, filtered", "lower",

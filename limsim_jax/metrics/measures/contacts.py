@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from limsim_jax.metrics.blame import ContactCarry, ContactStep, contact_init, contact_result, contact_update
-from limsim_jax.metrics.description import Description
+from limsim_jax.metrics.description import Description, Plot
 from limsim_jax.metrics.measure import Derived, Measure, Summary
 from limsim_jax.metrics.reductions import Measured, measured
 from limsim_jax.metrics.step import StepView
@@ -68,7 +68,7 @@ class Contacts(Measure):
             formula="Greatest delta-v of all contacts.",
             source="nuplan-devkit, collision_utils.py",
             missing=_NONE,
-            plot="Delta-v of the worst contact, m/s",
+            plot=Plot("Delta-v of the worst contact", "m/s"),
         ),
     )  # fmt: skip
 

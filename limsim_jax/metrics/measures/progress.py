@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from limsim_jax.metrics.description import Description, Headline
+from limsim_jax.metrics.description import Description, Headline, Plot
 from limsim_jax.metrics.measure import Derived, Measure, Summary
 from limsim_jax.metrics.reductions import Measured, measured
 from limsim_jax.metrics.step import StepView
@@ -46,7 +46,7 @@ class Progress(Measure):
             "completion_time", "s until the goal", "Drive and rules", "lower",
             formula="Time from the first step of the ego to its arrival.",
             missing="The ego did not arrive.",
-            plot="Time to the goal, s",
+            plot=Plot("Time to the goal", "s"),
         ),
         Description(
             "duration", "s that the ego was there", "Drive and rules",
@@ -65,7 +65,7 @@ class Progress(Measure):
             formula="distance / duration.",
             missing="The ego was on the road for no full step.",
             headline=Headline(13, "mean speed", unit="m/s"),
-            plot="Mean speed of the ego, m/s",
+            plot=Plot("Mean speed of the ego", "m/s"),
         ),
     )  # fmt: skip
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.metrics.description import Description, Headline
+from limsim_jax.metrics.description import Description, Headline, Plot
 from limsim_jax.metrics.measure import Derived, Measure, Summary
 from limsim_jax.metrics.reductions import Episodes, Least, Measured, measured
 from limsim_jax.metrics.safety import (
@@ -52,7 +52,7 @@ class TimeToCollision(Measure):
             source=_HAYWARD,
             missing=_NO_COLLISION,
             headline=Headline(9, "least TTC, median", "median", "s"),
-            plot="Least TTC, s",
+            plot=Plot("Least TTC", "s"),
         ),
         Description(
             "min_ttc_time", "s, when", "Safety",
@@ -135,7 +135,7 @@ class Following(Measure):
             "min_thw", "s, least time headway", "Safety", "higher",
             formula="gap / v.",
             missing=_NO_LEADER,
-            plot="Least time headway, s",
+            plot=Plot("Least time headway", "s"),
         ),
         Description(
             "max_drac", "m/s^2, hardest braking that the leader asked for (1-D)", "Safety", "lower",
@@ -143,7 +143,7 @@ class Following(Measure):
             "least.",
             source="Cooper and Ferguson 1976",
             missing=_NO_LEADER,
-            plot="Highest DRAC, m/s²",
+            plot=Plot("Highest DRAC", "m/s²"),
         ),
         Description(
             "max_drac_time", "s, when", "Safety",
@@ -185,7 +185,7 @@ class PostEncroachment(Measure):
             "inside.",
             source="Allen, Shin and Cooper 1978",
             missing="No conflict zone was passed by both the ego and another vehicle.",
-            plot="Least post-encroachment time, s",
+            plot=Plot("Least post-encroachment time", "s"),
         ),
         Description(
             "min_pet_time", "s, when", "Safety",
@@ -216,7 +216,7 @@ class Distance(Measure):
             "min_distance", "m, least distance to another body", "Safety", "higher",
             formula="Euclidean distance of the boxes, on the level of the ego; 0 where they overlap.",
             missing="No other vehicle was there.",
-            plot="Least distance to another body, m",
+            plot=Plot("Least distance to another body", "m"),
         ),
     )  # fmt: skip
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from limsim_jax.metrics.blame import ahead, behind
-from limsim_jax.metrics.description import Better, Description, Headline, Kind
+from limsim_jax.metrics.description import Better, Description, Headline, Kind, Plot
 from limsim_jax.metrics.measure import Derived, Measure, Summary
 from limsim_jax.metrics.reductions import Measured, measured
 from limsim_jax.metrics.scores import (
@@ -37,7 +37,7 @@ def _nuplan(
     return Description(
         name, meaning, "Scores", "higher", kind, formula, "nuplan-devkit, closed-loop metric aggregator",
         _NUPLAN_SHORT, Headline(10, "nuPlan score", unit="of 1") if score else None,
-        "nuPlan score" if score else "",
+        Plot("nuPlan score", "of 1") if score else None,
     )  # fmt: skip
 
 
@@ -142,7 +142,7 @@ class Carla(Measure):
             source="CARLA leaderboard 2.0, statistics_manager.py",
             missing="The ego was on the road for no full step.",
             headline=Headline(11, "CARLA score", unit="of 100"),
-            plot="CARLA driving score",
+            plot=Plot("CARLA driving score", "of 100"),
         ),
         Description(
             "carla_penalty", "0 to 1", "Scores", "higher",
@@ -193,7 +193,7 @@ def _limsim(version: str) -> list[Description]:
                 f"limsim_{version}_{part}", meaning, "Scores", "higher", "mean",
                 formula.format(version=version),
                 _LIMSIM, _NO_SECOND, Headline(12, "LimSim score, corrected", unit="of 100") if main else None,
-                "LimSim score, corrected" if main else "",
+                Plot("LimSim score, corrected", "of 100") if main else None,
             )
         )  # fmt: skip
     return found

@@ -28,6 +28,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from limsim_jax.files import write_whole
+from limsim_jax.metrics.catalog import catalog, describe
+from limsim_jax.metrics.description import SECTIONS
 from limsim_jax.report.formats import estimate_text, number, with_bounds
 from limsim_jax.report.page import charts
 from limsim_jax.report.page.content import (
@@ -59,34 +61,6 @@ LISTED = 40
 
 LEAD = 3.0
 """s before its key moment at which a replay opens."""
-
-_DISTRIBUTIONS = (
-    ("min_ttc", "Least TTC", "s"),
-    ("min_thw", "Least time headway", "s"),
-    ("min_pet", "Least post-encroachment time", "s"),
-    ("min_distance", "Least distance to another body", "m"),
-    ("max_drac", "Highest DRAC", "m/s²"),
-    ("max_delta_v", "Delta-v of the worst contact", "m/s"),
-    ("completion_time", "Time to the goal", "s"),
-    ("mean_speed", "Mean speed of the ego", "m/s"),
-    ("min_acceleration", "Hardest braking", "m/s²"),
-    ("max_lateral_acceleration", "Highest lateral acceleration", "m/s²"),
-    ("max_jerk", "Highest jerk", "m/s³"),
-    ("nuplan_score", "nuPlan score", "of 1"),
-    ("carla_score", "CARLA driving score", "of 100"),
-    ("limsim_corrected_total", "LimSim score, corrected", "of 100"),
-    ("traffic_mean_speed", "Mean speed of the traffic", "m/s"),
-)
-
-_SECTIONS = {
-    "Drive and rules": (),
-    "Safety": ("min_ttc", "ttc_", "near_miss", "min_thw", "max_drac", "min_pet", "min_distance", "rss_",
-               "contact", "at_fault", "had_", "max_delta_v", "crashes_"),
-    "Comfort": ("min_acceleration", "max_acceleration", "max_lateral", "max_jerk", "max_longitudinal",
-                "max_yaw", "rms_", "comfortable"),
-    "Scores": ("nuplan_", "carla_", "limsim_"),
-    "Traffic": ("traffic_",),
-}  # fmt: skip
 
 
 def write_report(
@@ -262,7 +236,8 @@ def _by_scenario(parts: Mapping[Group, pa.Table], found: Found, names: Names) ->
 def _distributions(parts: Mapping[Group, pa.Table], names: Names) -> list[dict[str, Any]]:
     figures = []
     labels = [names.label(group) for group in parts]
-    for metric, label, unit in _DISTRIBUTIONS:
+    plotted = [(x.name, *x.plot) for x in catalog() if x.plot is not None]
+    for metric, label, unit in plotted:
         samples, missing, total = [], 0, 0
         for part in parts.values():
             x = columns(part, [metric])[:, 0] if metric in part.column_names else np.empty(0)
@@ -278,14 +253,13 @@ def _distributions(parts: Mapping[Group, pa.Table], names: Names) -> list[dict[s
 
 
 def _all_metrics(parts: Mapping[Group, pa.Table], found: Found) -> list[dict[str, Any]]:
-    """Titles, and their metrics by how the names begin; a metric that fits nowhere is of the drive."""
-    sections: dict[str, list[dict[str, Any]]] = {title: [] for title in _SECTIONS}
+    """Titles of sections, and their metrics."""
+    sections: dict[str, list[dict[str, Any]]] = {title: [] for title in SECTIONS}
     for metric in dict.fromkeys(metric for *_, metric in found):
         of_groups = [found.get((*group, metric)) for group in parts]
         meaning = next((row["meaning"] for row in of_groups if row is not None), "")
-        fits = [title for title, start in _SECTIONS.items() if metric.startswith(start)]
         row = {"metric": metric, "meaning": meaning, "cells": [_full_cell(row) for row in of_groups]}
-        sections[fits[0] if fits else "Drive and rules"].append(row)
+        sections[describe(metric, meaning).section].append(row)
     return [{"title": title, "rows": rows} for title, rows in sections.items() if rows]
 
 
