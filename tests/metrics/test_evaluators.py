@@ -1,6 +1,7 @@
 """Evaluators of one ego, of several, and of the traffic alone, on the same random records."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -15,6 +16,8 @@ from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos, EvaluateTraff
 from limsim_jax.metrics.reductions import on_host
 
 STEPS = 7
+
+pytestmark = pytest.mark.engine
 
 
 class Worst(Metric):
@@ -48,12 +51,14 @@ def story(seed: int, rows: int = 2) -> list[Any]:
     ]
 
 
-def measure(evaluator: Any, ticks: list[Any]) -> dict[str, Any]:
-    """All results over the steps after the first one, in decisions of two."""
+OWN = (Worst(),)
 
-    @jax.jit
-    def all_of(start, ticks):
-        lane_map = crossing()
+
+@functools.cache
+def program(evaluator: Any) -> Any:
+    """Results over the steps after the first one, in decisions of two."""
+
+    def all_of(lane_map, start, ticks):
         carry = evaluator.init(CONFIG, lane_map, start)
         records = jax.vmap(lambda tick: evaluator.record(CONFIG, lane_map, tick))(ticks)
         decisions = jax.tree.map(lambda x: x.reshape(STEPS // 2, 2, *x.shape[1:]), records)
@@ -63,7 +68,11 @@ def measure(evaluator: Any, ticks: list[Any]) -> dict[str, Any]:
 
         return evaluator.result(CONFIG, lane_map, jax.lax.scan(update, carry, decisions)[0])
 
-    return on_host(jax.device_get(all_of(ticks[0].state, stacked(ticks[1:]))))
+    return jax.jit(all_of)
+
+
+def measure(evaluator: Any, ticks: list[Any]) -> dict[str, Any]:
+    return on_host(jax.device_get(program(evaluator)(crossing(), ticks[0].state, stacked(ticks[1:]))))
 
 
 def assert_same(found, expected):
@@ -75,12 +84,11 @@ def assert_same(found, expected):
 
 @pytest.fixture(scope="module")
 def both():
-    own = (Worst(),)
     pairs = []
     for seed in range(3):
         ticks = story(seed)
-        alone = [measure(EvaluateEgo(ego=k, metrics=own), ticks) for k in range(2)]
-        pairs.append((measure(EvaluateEgos(2, metrics=own), ticks), alone))
+        alone = [measure(EvaluateEgo(ego=k, metrics=OWN), ticks) for k in range(2)]
+        pairs.append((measure(EvaluateEgos(2, metrics=OWN), ticks), alone))
     return pairs
 
 
@@ -103,8 +111,8 @@ def test_egos_of_one_world_differ(both):
 
 def test_one_of_several_is_one_ego():
     ticks = story(5)
-    alone = measure(EvaluateEgo(), ticks)
-    together = measure(EvaluateEgos(1), ticks)
+    alone = measure(EvaluateEgo(metrics=OWN), ticks)
+    together = measure(EvaluateEgos(1, metrics=OWN), ticks)
     assert {value.shape for value in together.values()} == {(1,)}
     for name, value in alone.items():
         np.testing.assert_array_equal(together[name][0], np.nan if value is None else value)
@@ -112,7 +120,7 @@ def test_one_of_several_is_one_ego():
 
 def test_traffic_alone_has_the_traffic_metrics_of_a_world_with_an_ego():
     ticks = story(6)
-    found = measure(EvaluateEgo(), ticks)
+    found = measure(EvaluateEgo(metrics=OWN), ticks)
     expected = {name: value for name, value in found.items() if name.startswith("traffic_")}
     assert set(expected) == {column.name for column in TRAFFIC}
     assert_same(measure(EvaluateTraffic(), story(6, rows=0)), expected)

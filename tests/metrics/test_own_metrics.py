@@ -145,11 +145,11 @@ def test_the_state_of_the_world_is_there_in_a_rollout():
     measure = EvaluateEgo(metrics=(LaneOffset(),))
 
     @jax.jit
-    def all_of(start, ticks):
-        carry = measure.init(CONFIG, crossing(), start)
-        records = jax.vmap(lambda tick: measure.record(CONFIG, crossing(), tick))(ticks)
-        carry = measure.update(CONFIG, crossing(), carry, records)
-        return measure.result(CONFIG, crossing(), carry)
+    def all_of(lane_map, start, ticks):
+        carry = measure.init(CONFIG, lane_map, start)
+        records = jax.vmap(lambda tick: measure.record(CONFIG, lane_map, tick))(ticks)
+        carry = measure.update(CONFIG, lane_map, carry, records)
+        return measure.result(CONFIG, lane_map, carry)
 
     slot = ticks[0].state.egos.slot[0]
     same = [
@@ -164,7 +164,7 @@ def test_the_state_of_the_world_is_there_in_a_rollout():
         for tick in ticks
     ]
     same = [tick._replace(left=np.zeros(N, bool)) for tick in same]
-    found = on_host(jax.device_get(all_of(same[0].state, stacked(same[1:]))))
+    found = on_host(jax.device_get(all_of(crossing(), same[0].state, stacked(same[1:]))))
     driven = found["duration"]
     assert driven is not None and driven > 0
     offsets = [abs(float(tick.state.d[slot])) for tick in same[1:]]
