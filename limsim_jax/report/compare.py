@@ -229,13 +229,17 @@ def _version_notes(here: Mapping[str, Any], there: Mapping[str, Any], scenario: 
     return [f"{scenario}: A and B were not made by the same program: {text}"]
 
 
+_EGOS = 1 << 20  # more than egos in a world
+
+
 def _compared(
     a: Results, b: Results, part_a: pa.Table, part_b: pa.Table, first: Group, second: Group, level: float
 ) -> tuple[list[dict[str, Any]], list[str]]:
     part_a, units = with_shares(part_a, a.units)
     part_b, _ = with_shares(part_b, b.units)
     seeds_a, seeds_b = (np.asarray(part["seed"].to_numpy()) for part in (part_a, part_b))
-    seeds, at_a, at_b = np.intersect1d(seeds_a, seeds_b, return_indices=True)
+    keys = [part["seed"].to_numpy() * _EGOS + part["ego"].to_numpy() for part in (part_a, part_b)]
+    seeds, at_a, at_b = np.intersect1d(*keys, return_indices=True)  # one key per seed and ego
     if not seeds.size:
         raise ValueError(
             f"{first[0]}: no seed in common: {seeds_a.min()} to {seeds_a.max()} in {a.path}, "

@@ -88,7 +88,7 @@ def groups(results: Results) -> dict[Group, pa.Table]:
     parts = {}
     for scenario, policy in order:
         rows = (pc.field("scenario") == scenario) & (pc.field("policy") == policy)
-        parts[scenario, policy] = table.filter(rows).sort_by("seed")
+        parts[scenario, policy] = table.filter(rows).sort_by([("seed", "ascending"), ("ego", "ascending")])
     return parts
 
 
@@ -312,6 +312,7 @@ _WORST_SCHEMA = pa.schema(
         ("scenario", pa.string()),
         ("policy", pa.string()),
         ("seed", pa.int64()),
+        ("ego", pa.int32()),
         ("metric", pa.float64()),
         ("contact", pa.bool_()),
         ("at_fault", pa.bool_()),
@@ -338,7 +339,7 @@ def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
     other contacts, both by delta-v; episodes off the road; episodes without success; the rest by the least
     TTC. With `metric`: by its value, without the episodes in which it was not measured.
 
-    Columns: place, scenario, policy, seed, metric (its value), contact, at_fault, delta_v (m/s), min_ttc
+    Columns: place, scenario, policy, seed, ego, metric (its value), contact, at_fault, delta_v (m/s), min_ttc
     (s), left_road, failed (no success), and of the episode's worst moment kind, time (s), other (slot),
     value, responsible, module, avoidable_by_ego, avoidable_by_other.
 
@@ -363,17 +364,17 @@ def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
         order = np.lexsort((seeds, sign * ranked))
         order = order[~np.isnan(ranked[order])]
     order = order[: max(k, 0)]
-    chosen = table.select(["scenario", "policy", "seed"]).take(order).to_pylist()
-    moments = first_moments(results, [(r["scenario"], r["policy"], r["seed"]) for r in chosen])
+    chosen = table.select(["scenario", "policy", "seed", "ego"]).take(order).to_pylist()
+    moments = first_moments(results, [episode_key(row) for row in chosen])
     rows = []
     for place, (i, row) in enumerate(zip(order, chosen, strict=True), 1):
-        key = (row["scenario"], row["policy"], row["seed"])
+        key = episode_key(row)
         row |= dict(place=place, metric=None if ranked is None else float(ranked[i]))
         row |= {name: bool(view[name][i]) for name in ("contact", "at_fault", "left_road", "failed")}
         row["delta_v"] = float(view["delta_v"][i]) if row["contact"] else None
         row["min_ttc"] = float(view["min_ttc"][i]) if np.isfinite(view["min_ttc"][i]) else None
         moment = moments.get(key, {})
-        row |= {name: moment.get(name) for name in _WORST_SCHEMA.names[11:]}
+        row |= {name: moment.get(name) for name in _WORST_SCHEMA.names[12:]}
         if row["time"] is None:
             when = view["contact_time"][i] if row["contact"] else view["min_ttc_time"][i]
             row["time"] = null(float(when))
@@ -412,18 +413,25 @@ def _severity(table: pa.Table) -> dict[str, NDArray[Any]]:
     }
 
 
-def first_moments(
-    results: Results, episodes: Sequence[tuple[str, str, int]]
-) -> dict[tuple[str, str, int], dict[str, Any]]:
+EpisodeKey = tuple[str, str, int, int]
+"""Scenario, policy, seed and number of the ego."""
+
+
+def episode_key(row: Mapping[str, Any]) -> EpisodeKey:
+    """The episode that a row of any table is about."""
+    return row["scenario"], row["policy"], row["seed"], row.get("ego") or 0
+
+
+def first_moments(results: Results, episodes: Sequence[EpisodeKey]) -> dict[EpisodeKey, dict[str, Any]]:
     """The worst moment of each of these episodes that has one."""
     moments = results.moments
     if not episodes or not moments.num_rows:
         return {}
     wanted = set(episodes)
-    rows = moments.filter(pc.field("seed").isin(sorted({seed for *_, seed in wanted})))
-    found: dict[tuple[str, str, int], dict[str, Any]] = {}
+    rows = moments.filter(pc.field("seed").isin(sorted({seed for _, _, seed, _ in wanted})))
+    found: dict[EpisodeKey, dict[str, Any]] = {}
     for row in rows.sort_by([("rank", "descending")]).to_pylist():
-        key = (row["scenario"], row["policy"], row["seed"])
+        key = episode_key(row)
         if key in wanted:
             found[key] = row
     return found

@@ -75,6 +75,7 @@ class FakeEpisodes:
         n = failed.sum()
         moments = {
             "seed": np.repeat(worlds[failed], 2),
+            "ego": np.zeros(2 * n, np.int32),
             "rank": np.tile([1, 2], n),
             "kind": np.tile(np.array(["contact", "near_miss"], object), n),
             "time": np.repeat(60 * u[1][failed], 2),
@@ -83,7 +84,8 @@ class FakeEpisodes:
             "responsible": np.tile(np.array(["ego", None], object), n),
             "avoidable_by_ego": np.tile(np.array([True, None], object), n),
         }
-        return Outcome(worlds, metrics, moments, mixed(worlds + 1000003 * self.salt))
+        egos = np.zeros(len(worlds), np.int32)
+        return Outcome(worlds, egos, metrics, moments, mixed(worlds + 1000003 * self.salt))
 
     @property
     def salt(self) -> int:

@@ -30,7 +30,9 @@ def made(
         n = len(next(iter(metrics.values())))
         seeds = np.asarray(metrics.pop("seed", range(n)), np.int64)
         digest = np.asarray(metrics.pop("digest", range(n)), np.uint64)
-        part = pa.table({"scenario": [scenario] * n, "policy": [policy] * n, "seed": seeds, "digest": digest})
+        egos = np.asarray(metrics.pop("ego", [0] * n), np.int32)
+        keys = {"scenario": [scenario] * n, "policy": [policy] * n, "seed": seeds, "ego": egos}
+        part = pa.table(keys | {"digest": digest})
         for name, values in metrics.items():
             part = part.append_column(name, pa.array(np.asarray(values, float), from_pandas=True))
         parts.append(part)

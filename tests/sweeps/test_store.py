@@ -46,7 +46,7 @@ def test_what_is_written_comes_back(tmp_path):
     results = open_results(tmp_path)
     outcome = fake.run([1, 2, 3, 10, 11, 12])
     rows = results.episodes
-    assert rows.column_names == ["scenario", "policy", "seed", "digest", *outcome.metrics]
+    assert rows.column_names == ["scenario", "policy", "seed", "ego", "digest", *outcome.metrics]
     assert rows.column("seed").to_pylist() == [1, 2, 3, 10, 11, 12]
     assert set(rows.column("scenario").to_pylist()) == {"flat"}
     np.testing.assert_array_equal(rows.column("digest").to_numpy(), outcome.digest)
@@ -440,7 +440,11 @@ def test_unknown_columns_of_moments_are_an_error(tmp_path):
     with pytest.raises(ValueError, match="no column 'when'"):
         shards.write(
             Outcome(
-                outcome.seeds, outcome.metrics, {"seed": np.array([0]), "when": np.array([1])}, outcome.digest
+                outcome.seeds,
+                outcome.egos,
+                outcome.metrics,
+                {"seed": np.array([0]), "when": np.array([1])},
+                outcome.digest,
             )
         )
 

@@ -309,9 +309,7 @@ def test_fixed_programs_follow_the_clock():
     state = state_of("intersection", [0], [5.0], [5.0], [0])
     none = jnp.full((1, 1), -1)
     for step in (0, 100, 345, 1111):
-        lights = switch(
-            CONFIG, lane_map, dataclasses.replace(state, step=jnp.int32(step)), none, 0.0 * none
-        )
+        lights = switch(CONFIG, lane_map, dataclasses.replace(state, step=jnp.int32(step)), none, 0.0 * none)
         np.testing.assert_array_equal(lights.phase, phase_at(lane_map.signals, step * 0.1))
 
 
