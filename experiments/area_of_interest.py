@@ -41,8 +41,8 @@ AREAS = ((2, 15.0), (4, 25.0), (8, 50.0), (16, 50.0), (SLOTS, EVERYWHERE))
 def with_area(experiment: ExperimentFile, slots: int, radius: float) -> ExperimentFile:
     """The experiment with LimSim-TM for `slots` vehicles beside the ego."""
     options = {"around": "limsim_tm", "slots": slots, "radius": radius}
-    ego = experiment.ego.model_copy(update={"options": options})
-    return experiment.model_copy(update={"ego": ego, "slots": SLOTS})
+    ego = experiment.ego[0].model_copy(update={"options": options})
+    return experiment.model_copy(update={"ego": (ego,), "slots": SLOTS})
 
 
 def outcomes(experiment: ExperimentFile, seeds: range, chunk: int) -> tuple[dict[str, np.ndarray], float]:

@@ -36,9 +36,6 @@ _limsim_tm = "decide", "group", "plan", "policy", "search"
 _hooked += [f"limsim_jax.policies.limsim_tm.{name}" for name in _limsim_tm]
 _pdm = "learned", "policy", "proposals", "road", "score", "tracker"
 _hooked += [f"limsim_jax.policies.pdm.{name}" for name in _pdm]
-_hooked += [
-    f"limsim_jax.metrics.{name}" for name in ("blame", "motion", "safety", "scores", "traffic", "measures")
-]
 _calibration = "cleaning", "fit", "matching", "population", "uncertainty"
 _hooked += [f"limsim_jax.calibration.{name}" for name in _calibration]
 _hooked += [f"limsim_jax.calibration.closed_loop.{name}" for name in ("chains", "descent", "distances")]

@@ -260,7 +260,7 @@ def test_bug_is_a_traceback(run, write, monkeypatch):
     def broken(network):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr(cli, "_facts", broken)
+    monkeypatch.setattr("limsim_jax.cli.maps._facts", broken)
     with pytest.raises(RuntimeError, match="a bug"):
         run("map", "info", write(two_roads()))
 

@@ -10,7 +10,6 @@ from limsim_jax.maps.lane_map import NO_LANE
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import lane_states
 from limsim_jax.metrics.safety import encounter, overlaps
-from limsim_jax.policies.simple import ConstantSpeed, FollowLane
 from limsim_jax.sweeps.episode import Episodes, _succeeds
 from limsim_jax.sweeps.experiment import Bounds, ExperimentFile
 from limsim_jax.sweeps.moments import key_moments
@@ -89,15 +88,8 @@ def test_both_kinds_of_end_occur():
     assert all(replayed("like_traffic", seed).metrics["contacts"] == 0 for seed in SEEDS)
 
 
-class Modular(ConstantSpeed):
-    """As blind as before with one module replaced; with the other, it looks."""
-
-    def variants(self, seen):
-        return {"prediction": ConstantSpeed(), "planning": FollowLane()}
-
-
 def test_the_module_that_is_to_blame():
-    blind, modular = (episodes(name) for name in ("constant_speed", "test_episodes:Modular"))
+    blind, modular = (episodes(name) for name in ("constant_speed", "modular_policy:Modular"))
     hit = [seed for seed in SEEDS if replayed("constant_speed", seed).metrics["contacts"]]
     for seed in hit[:2]:
         row = modular.replay(seed).moments[0]
@@ -106,7 +98,7 @@ def test_the_module_that_is_to_blame():
         assert alone["module"] is None and alone["avoidable_by_ego"] == row["avoidable_by_ego"]
     calm = next(seed for seed in SEEDS if not replayed("like_traffic", seed).metrics["contacts"])
     assert not any(row.get("module") for row in replayed("like_traffic", calm).moments)
-    assert blind._references == {}
+    assert blind._reruns._references == {}
 
 
 @pytest.mark.parametrize("policy, seed", cases())

@@ -53,9 +53,9 @@ def test_the_ego_starts_where_the_file_says_and_nobody_is_on_top_of_it(name):
     start = jax.device_get(scenario.start)
     ids = lane_ids(network)
     lane = network.lanes[ids[start.lane[0, 0]]]
-    assert lane.road == experiment.ego.start.rstrip("+-")
+    assert lane.road == experiment.ego[0].start.rstrip("+-")
     assert (start.egos.slot == 0).all() and start.active[:, 0].all()
-    np.testing.assert_allclose(start.s[:, 0], experiment.ego.s, rtol=1e-6)
+    np.testing.assert_allclose(start.s[:, 0], experiment.ego[0].s, rtol=1e-6)
     assert (start.v[:, 0] > 3).all(), "it starts in motion"
     same = start.active[:, 1:] & (start.lane[:, 1:] == start.lane[:, :1])
     front, rear = start.s[:, 1:], start.s[:, 1:] - start.shape.length[:, 1:]
@@ -81,11 +81,11 @@ def test_other_map_and_policy(write):
         GOOD.replace('goal = "2"', 'goal = "2"\noptions = { speed = 3.0 }\npolicy = "constant_speed"')
     )
     (experiment,) = read_experiments(path)
-    assert (experiment.policy, experiment.ego.options) == ("constant_speed", {"speed": 3.0})
+    assert (experiment.policy, experiment.ego[0].options) == ("constant_speed", {"speed": 3.0})
     (other,) = read_experiments(path, policy="like_traffic", map_file="roundabout")
-    assert (other.policy, other.ego.options, other.map) == ("like_traffic", {}, "roundabout")
+    assert (other.policy, other.ego[0].options, other.map) == ("like_traffic", {}, "roundabout")
     (same,) = read_experiments(path, policy="constant_speed")
-    assert same.ego.options == {"speed": 3.0}
+    assert same.ego[0].options == {"speed": 3.0}
     (own,) = read_experiments(path, policy="limsim_jax.policies.simple:ConstantSpeed")
     assert own.policy == "ConstantSpeed" and Episodes(own).policy == "ConstantSpeed"
 

@@ -94,7 +94,7 @@ def test_every_file_says_what_it_is(tmp_path):
     about = json.loads(file.metadata.metadata[b"limsim_jax"])
     assert about["provenance"] == FakeEpisodes().provenance() and about["units"] == FakeEpisodes().units
     index = json.loads((tmp_path / "results.json").read_text())
-    assert index["format"] == 1
+    assert index["format"] == 2
     assert index["entries"][0]["provenance"] == FakeEpisodes().provenance()
     assert sorted(p.name for p in path.parent.iterdir()) == [
         path.name,
@@ -371,14 +371,14 @@ def test_a_chunk_of_other_results_is_refused(tmp_path):
 def test_another_format_is_refused(tmp_path):
     filled(tmp_path, FakeEpisodes())
     index = tmp_path / "results.json"
-    index.write_text(index.read_text().replace('"format": 1', '"format": 2'))
-    assert "has format 2, this version reads 1" in refused(tmp_path, FakeEpisodes())
-    with pytest.raises(ResultsError, match="has format 2"):
+    index.write_text(index.read_text().replace('"format": 2', '"format": 3'))
+    assert "has format 3, this version reads 2" in refused(tmp_path, FakeEpisodes())
+    with pytest.raises(ResultsError, match="has format 3"):
         open_results(tmp_path)
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", '{"format": 1}', '{"format": 1, "entries": [{}]}', "\x00" * 20]
+    "text", ["", "{", "[]", '{"format": 2}', '{"format": 2, "entries": [{}]}', "\x00" * 20]
 )
 def test_a_damaged_index_can_be_removed_and_is_made_again(tmp_path, text):
     filled(tmp_path, *both())

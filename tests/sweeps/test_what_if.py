@@ -30,10 +30,10 @@ class Counting(ConstantSpeed):
 
 @pytest.fixture(scope="module")
 def episodes():
-    ego = EgoTable(start="1-", s=40.0, goal="3+", policy="test_what_if:Counting")
+    ego = EgoTable(start="1-", s=40.0, goal="3+")
     traffic = TrafficTable(vehicles=6)
     values = {"name": "small", "map": "roundabout", "horizon": 10.0, "slots": 8}
-    found = Episodes(ExperimentFile(**values, ego=ego, traffic=traffic), chunk=1)
+    found = Episodes(ExperimentFile(**values, ego=(ego,), traffic=traffic), chunk=1, policy=Counting())
     found.rollout = replace(found.rollout, measure=None)  # metrics take long to compile
     return found
 
