@@ -3,6 +3,8 @@ from .api.experiment import Ego as Ego
 from .api.experiment import Experiment as Experiment
 from .api.experiment import Flow as Flow
 from .api.experiment import load_experiments as load_experiments
+from .api.map import Map as Map
+from .api.map import load_map as load_map
 from .api.results import Results as Results
 from .api.results import open_results as open_results
 from .api.sweep import sweep as sweep
@@ -14,8 +16,6 @@ from .maps import bundled_maps as bundled_maps
 from .maps.lane_map import LaneMap as LaneMap
 from .maps.lane_map import pose as pose
 from .maps.lane_map import to_frenet as to_frenet
-from .maps.map import Map as Map
-from .maps.map import load_map as load_map
 from .maps.network import MapError as MapError
 from .maps.network import Network as Network
 from .metrics.measure import Metric as Metric

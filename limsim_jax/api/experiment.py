@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
+from limsim_jax.api.map import Map, load_map
 from limsim_jax.maps import bundled_maps
-from limsim_jax.maps.map import Map, load_map
 from limsim_jax.maps.network import MapError, Network
 from limsim_jax.sweeps import experiment as _file
 from limsim_jax.sweeps.experiment import (

@@ -2,36 +2,17 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from limsim_jax.maps import build_lane_map, bundled_map, bundled_maps, read_network
 from limsim_jax.maps.network import ImportReport, Network
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from limsim_jax.maps.lane_map import LaneMap
-
-
-class Drawing:
-    """A figure that a notebook shows.
-
-    Args:
-      figure: of Matplotlib.
-    """
-
-    def __init__(self, figure: Figure) -> None:
-        self.figure = figure
-
-    def _repr_png_(self) -> bytes:
-        file = io.BytesIO()
-        self.figure.savefig(file, format="png")
-        return file.getvalue()
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,22 +74,7 @@ class Map:
     def with_goals(self, lanes: Iterable[str]) -> Map:
         """The map in which these lanes are goals, too; names of goals and unknown lanes are passed over."""
         new = [x for x in dict.fromkeys(lanes) if x not in self.goals and x in self.network.lanes]
-        return Map(self.network, (*self.extra_goals, *new)) if new else self
-
-    def draw(self, path: str | Path | None = None, **options: Any) -> Drawing:
-        """Draw the map on a page with a scale bar; a notebook shows it.
-
-        Args:
-          path: file to write as well: .png, .svg or .pdf.
-          options: of `report.draw.draw_map`: `bounds` (x_min, y_min, x_max, y_max, m), `labels`,
-            `conflicts`, `dpi`, and `size` (inches).
-
-        Raises:
-          MapError: see `report.draw.draw_map`.
-        """
-        from limsim_jax.report.draw import draw_map
-
-        return Drawing(draw_map(self.network, path, **options))
+        return type(self)(self.network, (*self.extra_goals, *new)) if new else self
 
     def __repr__(self) -> str:
         lanes = list(self.network.drivable_lanes())
