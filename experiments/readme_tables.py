@@ -1,4 +1,4 @@
-"""Put the figures of experiments/results/ into the pages of docs/results/ and the README.
+"""Put the measured figures into docs and README.
 
 python experiments/readme_tables.py           write them
 python experiments/readme_tables.py --check   fail unless they are there already
@@ -19,7 +19,7 @@ PAPER = {"highway": 76.3, "ramp": 64.6, "intersection": 86.3, "roundabout": 72.1
 
 
 def carla(result: dict[str, Any]) -> str:
-    """The towns of CARLA one by one, all other maps in a sentence."""
+    """The towns of CARLA one by one, other maps together."""
     rows = [
         "| map | waypoints | host lanes off, mm (max) | device lanes off, mm (median / max) "
         "| heading off (max) | junctions with equal movements |",
@@ -55,7 +55,7 @@ def sumo(result: dict[str, Any]) -> str:
 
 
 def speed(result: dict[str, Any]) -> str:
-    """Times from file to arrays, and look-ups per second at the largest batch."""
+    """Times from file to arrays, and look-ups per second."""
     cold, cached, machine = result["cold"], result["cached"], result["machine"]
     largest = max(row["batch"] for row in result["look_ups"])
     rate = {
@@ -138,7 +138,7 @@ def traffic_sumo(result: dict[str, Any]) -> str:
     one = result["one_lane"]["ballistic, as ours"]
 
     def mean(runs: list[dict[str, Any]], name: str) -> float:
-        values = [run[name] for run in runs if run[name] is not None]  # nobody may arrive in a jam
+        values = [run[name] for run in runs if run[name] is not None]  # no vehicle may arrive in a jam
         return sum(values) / max(len(values), 1)
 
     rows = [

@@ -101,8 +101,9 @@ print(xla_bridge.backends_are_initialized())
 
 
 def test_public_names_resolve():
-    assert len(limsim_jax.__all__) > 10
-    for name in limsim_jax.__all__:
+    names: list[str] = vars(limsim_jax)["__all__"]
+    assert len(names) > 10
+    for name in names:
         assert getattr(limsim_jax, name).__name__ == name
         assert name in dir(limsim_jax)
     with pytest.raises(AttributeError, match="attribute load_maps"):

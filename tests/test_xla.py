@@ -17,7 +17,7 @@ from limsim_jax.xla import (
 
 
 def compiled_text(function, *args):
-    return jax.jit(function).lower(*args).compile().as_text()
+    return jax.jit(function).lower(*args).compile().as_text() or ""
 
 
 def test_a_value_computed_once_stays_a_call_of_its_own():

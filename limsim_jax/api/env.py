@@ -126,7 +126,8 @@ class Env:
         self.experiment = experiment if isinstance(experiment, Experiment) else Experiment(experiment)
         if not self.experiment.file.ego:
             raise ExperimentError(f"{self.experiment.name}: ego: an environment needs at least one")
-        self.action, self.sample_time = action, sample_time
+        self.action: Kind = action
+        self.sample_time = sample_time
         self.observe = Observe() if observe is None else observe
         self.reward: Reward = ProgressReward() if reward is None else reward
         driver = _Commanded(action != "meta")

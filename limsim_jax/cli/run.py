@@ -135,7 +135,7 @@ def run(
 def _traffic(file: str, *, rate: float, vehicles: int, seconds: float, slots: int, dt: float) -> Experiment:
     """Plain traffic on a map: the default drivers, from all origins to all goals."""
     from limsim_jax.api.experiment import Experiment, Flow
-    from limsim_jax.maps.map import load_map
+    from limsim_jax.api.map import load_map
 
     return Experiment(
         map=load_map(path(file)),

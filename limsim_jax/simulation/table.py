@@ -58,11 +58,11 @@ def write_trace(path: Path, network: Network, lane_map: LaneMap, trace: Trace) -
 
 def _columns(
     network: Network, lane_map: LaneMap, trace: Trace
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Arrays `[T, N]` by name, and what some numbers stand for."""
     x, y = absolute(lane_map, trace.box[..., 0], trace.box[..., 1])
     slot = np.broadcast_to(np.arange(trace.active.shape[1]), trace.active.shape)
-    columns: dict[str, np.ndarray] = {
+    columns: dict[str, Any] = {
         "time": np.broadcast_to(trace.time[:, None], trace.active.shape),
         # vehicles of the start have no row of the schedule: numbers below 0
         "vehicle": np.where(trace.vehicle < 0, -1 - slot, trace.vehicle),
@@ -94,5 +94,5 @@ def _columns(
     return columns, ids
 
 
-def _is_driven(slot: np.ndarray, driven: np.ndarray) -> np.ndarray:
+def _is_driven(slot: np.ndarray, driven: Any) -> np.ndarray:
     return (slot[..., None] == driven[:, None, :]).any(-1)

@@ -165,10 +165,12 @@ def test_an_environment_steps_and_batches():
     assert obs.v.shape == (2, 1) and obs.other_x.shape[:2] == (2, 1)
     action = {"acceleration": jnp.asarray([[1.0], [-2.0]]), "steering": jnp.zeros((2, 1))}
     before, rewards = obs, []
+    reward = terminated = info = None
     for k in range(env.horizon):
         obs, state, reward, terminated, truncated, info = step(keys, state, action)
         rewards.append(reward)
         assert bool(truncated.all()) == (k == env.horizon - 1)
+    assert reward is not None and terminated is not None and info is not None
     assert reward.shape == (2, 1) and terminated.shape == (2, 1)
     assert obs.v[0, 0] > before.v[0, 0] > obs.v[1, 0]
     assert sum(r[0, 0] for r in rewards) > sum(r[1, 0] for r in rewards)
@@ -181,4 +183,4 @@ def test_an_environment_needs_an_ego_and_a_known_action():
     with pytest.raises(lj.ExperimentError, match="ego: an environment needs at least one"):
         lj.Env(lj.Experiment(map="roundabout", ego=None, horizon=5, vehicles=2))
     with pytest.raises(ValueError, match="action: 'wheel'; known are control"):
-        lj.Env("roundabout", action="wheel")
+        lj.Env("roundabout", action="wheel")  # pyright: ignore[reportArgumentType]

@@ -54,7 +54,7 @@ def test_the_ego_as_its_trace_has_it(policy, seed):
     assert metrics["max_overspeed"] == pytest.approx(np.maximum(v - limit, 0).max(), abs=1e-4)
     assert metrics["speeding"] == pytest.approx((v > limit + 0.01).mean(), abs=0.005)
     egos = episodes(policy)._egos
-    assert egos.goal is not None and egos.lane is not None
+    assert egos is not None and egos.goal is not None and egos.lane is not None
     goal = egos.goal[0]
     to_go = np.asarray(lane_map.routes.distance)[lane, goal] - s
     reached = to_go < 1e8

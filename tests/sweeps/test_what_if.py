@@ -76,7 +76,7 @@ def test_places_of_planned_vehicles_stay_as_many():
     options = {"slots": 3, "around": "follow_lane"}
     ego = EgoTable(start="1-", s=40.0, goal="3+", policy="area_of_interest", options=options)
     values = {"name": "small", "map": "roundabout", "horizon": 10.0, "slots": 8}
-    episodes = Episodes(ExperimentFile(**values, ego=ego, traffic=TrafficTable(vehicles=6)), chunk=1)
+    episodes = Episodes(ExperimentFile(**values, ego=(ego,), traffic=TrafficTable(vehicles=6)), chunk=1)
     episodes.rollout = replace(episodes.rollout, measure=None)
     run, lane_map, schedule, key, carry = stopped(episodes, SEED, [1.0])
     assert carry.state.egos.slot.shape == (1, 4)
