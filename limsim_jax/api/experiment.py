@@ -77,7 +77,7 @@ class Experiment:
       drivers: a `Population`, or the file of one.
       model: car-following model: "acc", "iidm", "idm", or a value such as `IDM()`.
       lane_changes: whether the traffic changes lanes.
-      after_collision: "stop", "remove", "end" or "ignore".
+      after_collision: "stop", "continue" or "end".
       success: metric to value or bounds, as `{"contacts": 0, "mean_speed": {"min": 8}}`.
       metrics: own metrics (`Metric`), as more columns.
       slots: vehicles that can be on the road at once.

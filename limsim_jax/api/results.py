@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from limsim_jax.report.tables import TextTable
     from limsim_jax.sweeps.episode import Episodes
 
-Makers = Mapping[tuple[str, str], Callable[[], "Episodes"]]
 """(scenario, policy) to a function that makes their worlds again."""
 
 
@@ -75,12 +74,10 @@ class Results:
       units: what every column means.
     """
 
-    def __init__(self, stored: Stored, makers: Makers | None = None, keep: Any = None) -> None:
+    def __init__(self, stored: Stored) -> None:
         self.stored = stored
         self.path, self.units = stored.path, stored.units
         self.episodes, self.moments = stored.episodes, stored.moments
-        self._makers = dict(makers or {})
-        self._keep = keep  # a temporary folder lives as long as this
         self._made: dict[tuple[str, str], Episodes] = {}
 
     @functools.cached_property
@@ -200,8 +197,7 @@ class Results:
         """What makes the worlds of a scenario and policy again."""
         group = scenario, policy
         if group not in self._made:
-            maker = self._makers.get(group)
-            self._made[group] = rebuild(self.stored, *group) if maker is None else maker()
+            self._made[group] = rebuild(self.stored, *group)
         return self._made[group]
 
     def report(self, path: str | Path | None = None, *, worst: int = 6) -> Path:

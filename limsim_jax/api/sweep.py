@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
+import weakref
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -68,11 +70,17 @@ def sweep(
     pairs = [(one, policy) for one in experiments for policy in wanted]
     episodes = [one.episodes(policy, chunk=chunk, metrics=metrics) for one, policy in pairs]
     _check_names([(x.scenario, x.policy) for x in episodes])
-    folder = tempfile.TemporaryDirectory(prefix="limsim-jax-") if out is None else None
-    path = Path(folder.name if folder else str(out))
-    with progress_bar(progress) as show:
-        runner.sweep(episodes, chosen, path, shard=shard, until_ci=until_ci, progress=show)
-    found = Results(open_results(path), keep=folder)
+    path = Path(tempfile.mkdtemp(prefix="limsim-jax-") if out is None else out)
+    try:
+        with progress_bar(progress) as show:
+            runner.sweep(episodes, chosen, path, shard=shard, until_ci=until_ci, progress=show)
+        found = Results(open_results(path))
+    except BaseException:
+        if out is None:
+            shutil.rmtree(path, ignore_errors=True)
+        raise
+    if out is None:
+        weakref.finalize(found, shutil.rmtree, path, ignore_errors=True)
     found._made |= {(x.scenario, x.policy): x for x in episodes}
     return found
 

@@ -70,8 +70,8 @@ def _columns(
     }
     ids = {"lane": np.array(lane_ids(network))}
     if trace.vehicle_class is not None:
-        columns["class"] = trace.vehicle_class
-        ids["class"] = np.array(VEHICLE_CLASSES)
+        columns["vehicle_class"] = trace.vehicle_class
+        ids["vehicle_class"] = np.array(VEHICLE_CLASSES)
     driven = np.zeros_like(trace.active) if trace.driven is None else _is_driven(slot, trace.driven)
     columns |= {
         "driven": driven,

@@ -181,7 +181,7 @@ def test_hypotheses_take_every_branch():
     sure = hypotheses(lane_map, state, times, known=0.8)
     with_split = several > 1
     assert np.allclose(np.asarray(sure.weight)[with_split].max(-1), 0.8)
-    with pytest.raises(ValueError, match=r"probability of 1\.5"):
+    with pytest.raises(ValueError, match=r"known: 1\.5; expected a probability"):
         hypotheses(lane_map, state, times, known=1.5)
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 from traffic_worlds import bundled, state_of
 
 from limsim_jax.maps.lane_map import lane_rows, pose
@@ -179,7 +180,7 @@ def test_what_happens_after_a_collision():
         np.testing.assert_array_equal(collision.after_collision(state, a, option), a)
     slot = jnp.asarray([2, 1])
     np.testing.assert_allclose(collision.after_collision(state, a[:2], "stop", slot), [-8, 1.5])
-    with pytest.raises(ValueError, match=r"'vanish'\? known are stop, continue, end"):
+    with pytest.raises((ValueError, TypeCheckError), match="vanish"):
         collision.after_collision(state, a, "vanish")  # pyright: ignore[reportArgumentType]
     v, way = state.v, 0.0
     for _ in range(40):

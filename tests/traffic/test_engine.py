@@ -240,10 +240,9 @@ def test_mobil_incentive():
         "old_now": -0.1,
         "old_then": 0.4,
     }
-    arrays = {name: jnp.float32(value) for name, value in values.items()}
+    arrays = {name: jnp.full(2, value) for name, value in values.items()}
     # egoist: own gain alone; altruist: + (-0.3 - 0.5) + (0.4 + 0.1)
-    np.testing.assert_allclose(incentive(**arrays, politeness=jnp.float32(0.0)), 0.8, rtol=1e-6)
-    np.testing.assert_allclose(incentive(**arrays, politeness=jnp.float32(1.0)), 0.5, rtol=1e-6)
+    np.testing.assert_allclose(incentive(**arrays, politeness=jnp.array([0.0, 1.0])), [0.8, 0.5], rtol=1e-6)
 
 
 @pytest.mark.parametrize("a_lead", [0.0, -2.7, 1.5])
