@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.optimize import linprog
 
 from limsim_jax import geometry
@@ -95,6 +96,7 @@ def test_box_separation_of_aligned_boxes_is_the_gap():
     )
 
 
+@pytest.mark.engine
 def test_box_separation_parts_the_boxes_and_is_symmetric():
     """Moved apart by its depth along the best axis, no overlap is left; moved by less, some is."""
     rng = np.random.default_rng(2)
@@ -111,6 +113,7 @@ def test_box_separation_parts_the_boxes_and_is_symmetric():
         assert depths[0] > 0 > depths[1]
 
 
+@pytest.mark.engine
 def test_box_separation_gradient_is_finite_and_right():
     a, b = random_boxes(np.random.default_rng(3), 2)
     with jax.enable_x64(True):

@@ -87,6 +87,7 @@ def test_import_is_light():
     assert run(f"import sys, limsim_jax; print([m for m in {heavy} if m in sys.modules])").strip() == "[]"
 
 
+@pytest.mark.engine
 def test_no_import_starts_a_backend():
     """Not even importing every module of the package."""
     names = [".".join(path.relative_to(REPO).with_suffix("").parts) for path in modules()]

@@ -99,6 +99,7 @@ def test_several_experiments_are_swept_not_run():
     ]  # fmt: skip
 
 
+@pytest.mark.engine
 def test_names_of_policies_must_differ_before_anything_runs(tmp_path):
     twice = [lj.ConstantSpeed(speed=3.0), lj.ConstantSpeed(speed=6.0)]
     with pytest.raises(ValueError, match="'constant_speed' stands twice in roundabout"):

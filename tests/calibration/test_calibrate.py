@@ -17,6 +17,8 @@ from limsim_jax.traffic.population_file import read_population
 from limsim_jax.traffic.vehicles import PARAMETERS as ALL
 from limsim_jax.traffic.vehicles import default_population
 
+pytestmark = pytest.mark.engine
+
 LENGTH = 4.5
 
 

@@ -166,6 +166,7 @@ def test_followers_outside_periods_are_cut_from_segments():
 # --- rollouts ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.engine
 def test_a_chain_of_one_is_a_rollout_behind_the_record():
     rng = np.random.default_rng(0)
     lead = leader_speed(384, DT, rng)
@@ -270,6 +271,7 @@ def test_floor_is_that_of_equal_vehicles():
     assert floor(link(unlike, period=30.0)).speed > 0.3
 
 
+@pytest.mark.engine
 def test_a_record_of_its_own_is_as_far_as_other_draws_are(known):
     part = known.part([0, 2])
     recorded, chains = samples(part), jax.tree.map(jnp.asarray, part.chains)
@@ -308,6 +310,7 @@ def known(made):
     return link(made, period=50.0)
 
 
+@pytest.mark.engine
 def test_gradients_are_those_of_finite_differences(known):
     part = known.part([0])
     recorded = samples(part)
@@ -331,6 +334,7 @@ def test_gradients_are_those_of_finite_differences(known):
         assert g[k] == pytest.approx(difference, abs=0.04 * float(np.linalg.norm(g))), PARAMETERS[k]
 
 
+@pytest.mark.engine
 def test_a_known_population_is_found_again(known, made, tmp_path):
     start = law([14.0, 1.0, 2.0, 1.4, 1.8], 0.25 * np.ones(5))
     seen = []

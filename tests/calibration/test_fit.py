@@ -29,6 +29,8 @@ from limsim_jax.calibration.synthetic import TYPICAL, drivers, follow
 from limsim_jax.calibration.uncertainty import uncertainty
 from limsim_jax.recordings import read_recording
 
+pytestmark = pytest.mark.engine
+
 DT = 0.1
 
 

@@ -16,6 +16,8 @@ from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.vehicles import default_population
 from limsim_jax.types import Config
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 
 

@@ -27,6 +27,8 @@ from limsim_jax.sweeps.experiment import ExperimentError, read_experiments
 from limsim_jax.traffic.population_file import read_population
 from limsim_jax.traffic.vehicles import default_population, sample_vehicles
 
+pytestmark = pytest.mark.engine
+
 SPREAD = np.array([0.1, 0.2, 0.15, 0.15, 0.15])
 CORRELATION = np.eye(5)
 CORRELATION[1, 3] = CORRELATION[3, 1] = -0.7

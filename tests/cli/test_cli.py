@@ -233,6 +233,7 @@ REFUSALS = {
 }
 
 
+@pytest.mark.engine
 @pytest.mark.parametrize("case", REFUSALS)
 def test_user_errors_are_one_line(case, run, tmp_path, monkeypatch):
     command, clue = REFUSALS[case]
@@ -283,6 +284,7 @@ def script(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, env=os.environ | {"MPLBACKEND": "Agg"})
 
 
+@pytest.mark.engine
 def test_as_a_process(write):
     done = script("map", "check", write(two_roads(gap=1.0)))
     assert (done.returncode, done.stderr) == (1, "")

@@ -45,6 +45,7 @@ def ran(tmp_path_factory):
 write = trace_file.write_trace
 
 
+@pytest.mark.engine
 def test_it_runs_and_writes(ran):
     assert ran.code == 0
     for file in ran.files.values():
@@ -55,6 +56,7 @@ def test_it_runs_and_writes(ran):
     np.testing.assert_allclose(ran.trace["time"], 0.1 * np.arange(1, 31), atol=1e-5)
 
 
+@pytest.mark.engine
 def test_summary_agrees_with_trace(ran):
     trace, summary = ran.trace, ran.summary
     active = trace["active"]
@@ -114,6 +116,7 @@ def test_traffic_starts_with_the_vehicles_asked_for(vehicles):
     assert (demand.initial, origins) == (vehicles, 4)
 
 
+@pytest.mark.engine
 def test_a_policy_is_timed():
     found = bench.bench_policy("roundabout", "constant_speed", worlds=3, repeats=1)
     assert found["worlds"] in (3, 4) and found["planned"] == 1 and found["policy"] == "constant_speed"

@@ -17,6 +17,8 @@ from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.policies.simple import ConstantSpeed
 from limsim_jax.recordings import Lanelet, Tracks, lanelet_network, read_tracks
 
+pytestmark = pytest.mark.engine
+
 TRAJECTORIES = SHARED / "trajectories"
 DT, STEPS, CARS = 0.1, 400, 5
 LATE, ENDING = CARS, CARS + 1

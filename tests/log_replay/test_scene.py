@@ -12,6 +12,8 @@ from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.policies.simple import ConstantSpeed
 from limsim_jax.recordings import Lanelet, RecordingError, Tracks, lanelet_network
 
+pytestmark = pytest.mark.engine
+
 TRAJECTORIES = SHARED / "trajectories"
 DT, STEPS, SPEED = 0.1, 81, 15.0
 

@@ -44,6 +44,7 @@ def check(row: referee.Comparison, junctions_as_carla: bool = True) -> None:
         assert figures["junctions_equal"] == figures["junctions"]
 
 
+@pytest.mark.engine
 @needs_shared
 @pytest.mark.parametrize(
     "name", ["carla_town01", "figure8_trafficlights", "crossing_complex_8_course", "road2_20"]
@@ -57,6 +58,7 @@ def test_maps_agree_with_carla(name: str) -> None:
         assert row.figures["lights"] == {"ids": 36, "lanes": 72, "as_carla": 72}
 
 
+@pytest.mark.engine
 @needs_shared
 def test_a_town_of_many_lanes(name: str = "carla_town03") -> None:
     row = compared(SHARED / "opendrive" / f"{name}.xodr")
@@ -75,6 +77,7 @@ def test_left_hand_traffic() -> None:
     assert row.figures["movements"] == 6
 
 
+@pytest.mark.engine
 @pytest.mark.parametrize("source", BUNDLED, ids=lambda p: p.stem)
 def test_bundled_maps_agree_with_carla(source: Path) -> None:
     row = compared(source)
@@ -96,6 +99,7 @@ def sound() -> Path:
     return REPO / "maps" / "intersection.xodr"
 
 
+@pytest.mark.engine
 def test_a_shifted_lane_is_found(sound: Path) -> None:
     """One lane, 6 cm to the left: off on the host and on the device, whatever CARLA is blamed for."""
     network, carla_map = read(sound)
@@ -111,6 +115,7 @@ def test_a_shifted_lane_is_found(sound: Path) -> None:
     assert any("formulas missed" in miss for miss in row.misses)
 
 
+@pytest.mark.engine
 @pytest.mark.parametrize(
     ("change", "expected"),
     [

@@ -195,6 +195,7 @@ def _compete(path, barrier, results):
     results.put(len(network.lanes))
 
 
+@pytest.mark.engine
 def test_competing_writers(file, folder):
     """Many processes load the same new map; one whole entry remains."""
     lanes = len(read_network(file, cache=False).lanes)

@@ -59,6 +59,7 @@ def crossing(angle, at=(30.0, 20.0), z=0.0, reverse=False):
 # --- geometry ---------------------------------------------------------------------------------
 
 
+@pytest.mark.engine
 @given(angle=st.floats(0.35, math.pi - 0.35), at=st.tuples(st.floats(9.0, 50.0), st.floats(9.0, 40.0)))
 @settings(max_examples=60, deadline=None, derandomize=True)
 def test_crossing_of_straight_lanes_is_closed_form(angle, at):
@@ -598,6 +599,7 @@ def sumo_nets():
     return sorted(SHARED.glob("sumo/*/*.net.xml"))
 
 
+@pytest.mark.engine
 @needs_shared
 @pytest.mark.parametrize("path", sumo_nets(), ids=lambda path: path.parent.name)
 def test_conflicts_are_the_foes_of_sumo(path):
@@ -641,6 +643,7 @@ def test_conflicts_are_the_foes_of_sumo(path):
         assert {e["prio"] for e in ours[one, two]} == {expected}
 
 
+@pytest.mark.engine
 @needs_shared
 @pytest.mark.parametrize(
     "path",

@@ -281,6 +281,7 @@ def test_a_step_in_width_stays_a_step():
     np.testing.assert_allclose(width, [3.0, 3.0, 5.0, 5.0], atol=1e-3)
 
 
+@pytest.mark.engine
 def test_side_s_is_level_across_the_road(host, device, rows):
     rng = np.random.default_rng(2)
     for name, side, other in (("inner", -1, "middle"), ("middle", 1, "inner"), ("middle", -1, "outer")):
@@ -358,6 +359,7 @@ def long_network(single):
     )  # fmt: skip
 
 
+@pytest.mark.engine
 @pytest.mark.parametrize("single", [True, False])
 def test_round_trip_on_ten_kilometres(single):
     host = long_network(single)
@@ -403,6 +405,7 @@ def test_round_trip_survives_kinks_outside_their_bends(host, device, rows):
         np.testing.assert_allclose(d2, d, atol=1e-3)
 
 
+@pytest.mark.engine
 def test_project_finds_the_nearest_lane_as_brute_force_does(host, device, rows):
     rng = np.random.default_rng(6)
     lanes = list(host.drivable_lanes())
@@ -440,6 +443,7 @@ def test_project_finds_the_nearest_lane_as_brute_force_does(host, device, rows):
         np.testing.assert_allclose(np.stack(back, -1), points[hit], atol=2e-3)
 
 
+@pytest.mark.engine
 def test_project_of_vehicles_on_lanes_finds_their_lane(host, device, rows):
     rng = np.random.default_rng(7)
     lane = rng.integers(0, 4, 2000)
@@ -452,6 +456,7 @@ def test_project_of_vehicles_on_lanes_finds_their_lane(host, device, rows):
     np.testing.assert_allclose(d2, d, atol=1e-3)
 
 
+@pytest.mark.engine
 def test_project_far_away_or_of_nan_is_no_lane(device):
     x = jnp.array([5e4, -5e4, jnp.nan, 3e9])
     found = project(device, x, jnp.zeros(4))[0]
@@ -461,6 +466,7 @@ def test_project_far_away_or_of_nan_is_no_lane(device):
 # --- gradients --------------------------------------------------------------------------------------
 
 
+@pytest.mark.engine
 @pytest.mark.parametrize("name", ["inner", "outer", "turn", "kinked"])
 def test_gradients_equal_finite_differences(host, name):
     with jax.enable_x64(True):
@@ -496,6 +502,7 @@ def test_gradients_equal_finite_differences(host, name):
         check(frenet, np.asarray(x), np.asarray(y), s + 0.3)
 
 
+@pytest.mark.engine
 def test_gradients_are_finite_everywhere(device, rows):
     """On interval bounds, ends, kinks, the null lane and at the centre of curvature, in float32."""
 
@@ -519,6 +526,7 @@ def test_gradients_are_finite_everywhere(device, rows):
                 assert np.isfinite(leaf).all(), (row, d)
 
 
+@pytest.mark.engine
 def test_gradients_are_finite_where_a_lane_turns_on_the_spot(device):
     """The tangent vanishes there; rows of constant position imitate that."""
     still = dataclasses.replace(device, rows=device.rows.at[:, 1:4].set(0).at[:, 5:8].set(0))
@@ -531,6 +539,7 @@ def test_gradients_are_finite_where_a_lane_turns_on_the_spot(device):
         assert np.isfinite(leaf).all()
 
 
+@pytest.mark.engine
 def test_gradients_on_interval_bounds_are_those_of_one_side():
     """A clip would halve them on its bounds."""
     radius = 50.0
@@ -540,6 +549,7 @@ def test_gradients_on_interval_bounds_are_those_of_one_side():
     np.testing.assert_allclose(turn, 1 / radius, rtol=0.02)
 
 
+@pytest.mark.engine
 def test_project_is_differentiable(device):
     x, y, _ = pose(device, 0, jnp.float32(50), jnp.float32(0.5))
     dx, dy = jax.grad(lambda x, y: project(device, x, y)[2], argnums=(0, 1))(x, y)
@@ -556,6 +566,7 @@ def test_bucket_sizes():
     ]  # fmt: skip
 
 
+@pytest.mark.engine
 def test_maps_in_the_same_buckets_share_one_program():
     traces = []
 
@@ -572,6 +583,7 @@ def test_maps_in_the_same_buckets_share_one_program():
     assert not np.array_equal(one.rows, other.rows)
 
 
+@pytest.mark.engine
 def test_padding_does_not_matter(host, device, rows):
     """The same lanes in a map with many others, in larger buckets, give the same bits."""
     more = [Line((60.0, 0.0, 0.0), x=-500.0 + 5 * k).lane(f"+{k}", road=f"+{k}") for k in range(100)]
@@ -587,6 +599,7 @@ def test_padding_does_not_matter(host, device, rows):
         assert np.array_equal(lm.curvature(device, row, s), lm.curvature(lane_map, row, s))
 
 
+@pytest.mark.engine
 def test_scalars_arrays_and_vmap_agree(device):
     lane, s, d = jnp.array([0, 1, 5, -1]), jnp.array([3.0, 70.0, 4.0, 0.5]), jnp.array([0.5, -1.0, 0.0, 2.0])
     x, y, heading = pose(device, lane, s, d)
@@ -605,6 +618,7 @@ def test_scalars_arrays_and_vmap_agree(device):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.engine
 def test_null_lane_is_inert(device):
     s = jnp.array([-10.0, 0.0, 0.5, 100.0])
     for leaf in jax.tree.leaves(

@@ -33,6 +33,8 @@ from limsim_jax.maps.network import Lane, MapError, Network
 from limsim_jax.maps.opendrive import read_opendrive
 from limsim_jax.maps.sumo import read_sumo
 
+pytestmark = pytest.mark.engine
+
 LIMIT = 10.0  # s for one file
 Reader = Callable[[Path], Network]
 READERS: dict[str, Reader] = {".xodr": read_opendrive, ".net.xml": read_sumo}

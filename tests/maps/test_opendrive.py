@@ -325,6 +325,7 @@ def test_wrong_root_empty_and_entities(tmp_path):
 REAL = sorted((SHARED / "opendrive").glob("*.xodr"))
 
 
+@pytest.mark.engine
 @needs_shared
 @pytest.mark.parametrize("path", REAL, ids=lambda p: p.stem)
 def test_real_maps_load_and_every_seam_is_in_the_report(path):

@@ -17,6 +17,8 @@ from opendrive_formulas import OpenDriveFormulas
 from limsim_jax.maps.network import Lane, Network
 from limsim_jax.maps.opendrive import read_opendrive
 
+pytestmark = pytest.mark.engine
+
 POSE = 1e-4  # m, what `Lane.pose` promises between samples
 KINK = 0.02  # m; around a kink the centre line is rounded off within this
 

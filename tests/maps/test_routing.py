@@ -425,6 +425,7 @@ def test_distances_are_those_of_sumos_router(name):
     assert compared > 20
 
 
+@pytest.mark.engine
 @needs_shared
 @pytest.mark.parametrize("name", ["limsim_town05/Town05", "bologna_pasubio/pasubio_buslanes"])
 def test_every_exit_of_a_town_can_be_reached(name):

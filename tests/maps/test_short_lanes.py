@@ -22,6 +22,8 @@ from limsim_jax.traffic.motion import boxes, tails
 from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config
 
+pytestmark = pytest.mark.engine
+
 CUT = 10.0  # m of the turn in its first piece: it has parted from the straight way by 0.8 m there
 
 

@@ -174,6 +174,7 @@ def states_in_sumo(path, *options):
     return [(int(step), name, state) for step, name, state in re.findall(r"^(\d+) (\S+) (\S+)$", out, re.M)]
 
 
+@pytest.mark.engine
 def test_phases_and_offsets_are_those_of_sumo(grid):
     net = read_network(grid)
     table = build_signals(net, rows(net))
@@ -187,6 +188,7 @@ def test_phases_and_offsets_are_those_of_sumo(grid):
         assert net.programs[name].phases[phase].state == state, (step, name)
 
 
+@pytest.mark.engine
 def test_letters_of_lights_that_are_off(grid):
     """SUMO switched off shows `o` to minor links and `O` to those with right of way."""
     net = read_network(grid)
@@ -406,6 +408,7 @@ def signal_maps():
     return [path for path in sorted(SHARED.glob("opendrive/*.xodr")) if b"<signal " in path.read_bytes()]
 
 
+@pytest.mark.engine
 @needs_shared
 @pytest.mark.parametrize("path", signal_maps(), ids=lambda path: path.stem)
 def test_lights_of_real_maps_get_safe_programs(path):

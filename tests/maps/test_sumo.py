@@ -101,18 +101,21 @@ def assert_sound(network: Network) -> None:
         assert all(network.movements[j].junction == m.junction for j in m.yields_to | m.foes)
 
 
+@pytest.mark.engine
 @needs_shared
 @pytest.mark.parametrize("path", NETS, ids=[p.parent.name for p in NETS])
 def test_equals_sumolib(path):
     assert_equal(path)
 
 
+@pytest.mark.engine
 @pytest.mark.parametrize("name", referee.GENERATED)
 def test_generated_equal_sumolib(generated, name):
     network = assert_equal(generated[name])
     assert ("left-hand" in name) == all(road.left_hand for road in network.roads.values())
 
 
+@pytest.mark.engine
 def test_the_comparison_can_fail(generated, tmp_path, monkeypatch):
     """Each change of the file makes a mismatch of the expected kind."""
     path = generated["grid with lights, crossings, bicycle lanes"]
@@ -181,6 +184,7 @@ def run_libsumo(code: str, *arguments: str) -> list[str]:
     return [line[2:] for line in done.stdout.splitlines() if line.startswith("> ")]
 
 
+@pytest.mark.engine
 @needs_shared
 def test_program_in_use_is_sumos():
     folder = SUMO / "bologna_pasubio"
@@ -330,6 +334,7 @@ def test_roundabout_and_unknown_elements_are_reported(read):
     assert counts["roundabout", Action.READ] == 1
 
 
+@pytest.mark.engine
 @needs_shared
 def test_every_element_is_in_the_report():
     """The report counts every element of the file."""
@@ -478,6 +483,7 @@ polylines = st.lists(
 )  # length of each segment and turn before it
 
 
+@pytest.mark.engine
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(polylines, st.sampled_from([0.05, 0.32, math.inf]))
 def test_curve_of_any_polyline(steps, tolerance):
@@ -516,6 +522,7 @@ def test_pose_is_within_a_tenth_of_a_millimetre_of_the_curve(read):
     assert turned == pytest.approx(mine.heading[-1] - mine.heading[0], abs=0.02)
 
 
+@pytest.mark.engine
 def test_curves_inside_junctions_are_nearer_to_what_was_sampled(generated, tmp_path):
     found = referee.compare_inside(generated["spider"], "spider", tmp_path)
     assert found.lanes > 100
@@ -688,6 +695,7 @@ def test_gzip_is_the_same(tmp_path):
     assert plain.file_hash == packed.file_hash
 
 
+@pytest.mark.engine
 def test_mutated_files_raise_map_errors_only(generated, tmp_path):
     """Any damage gives a sound network or one clear error."""
     source = generated["grid with lights, crossings, bicycle lanes"]

@@ -57,6 +57,7 @@ def readme_counts() -> dict[str, int]:
     return {name: int(cells.split("|")[5]) for name, cells in rows if int(cells.split("|")[5])}
 
 
+@pytest.mark.engine
 @needs_shared
 @pytest.mark.parametrize("name", readme_counts())
 def test_counts_and_values_equal_sumolib(name):
@@ -128,6 +129,7 @@ def test_configurations():
 # ---- against SUMO itself
 
 
+@pytest.mark.engine
 def test_defaults_of_vehicle_classes_are_sumos(read, tmp_path, network):
     pytest.importorskip("libsumo")
     classes = sorted(VEHICLE_CLASSES | {"ignoring"})

@@ -329,6 +329,7 @@ def test_slots_have_a_limit():
         contact_init(4097)
 
 
+@pytest.mark.engine
 def test_a_slot_that_was_empty_holds_a_new_vehicle():
     standing = (20.0, 0, 0, 0.0)
     seen = {"absent": lambda i: [0, i in (45, 46), 0]}

@@ -52,6 +52,7 @@ def measure(r, *, reference=False) -> dict[str, Any]:
 # --- episodes with known answers -----------------------------------------------------------------------
 
 
+@pytest.mark.engine
 def test_a_free_drive():
     arrived = np.arange(61) == 60
     found = measure(free(arrived=arrived))
@@ -83,6 +84,7 @@ def test_a_free_drive():
     assert found["nuplan_progress"] == pytest.approx(10 / 15, rel=0.02)
 
 
+@pytest.mark.engine
 def test_not_there_nothing_measured():
     r = free(30)
     r["active"][:, 0] = False
@@ -448,6 +450,7 @@ def assert_same(a, b):
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.engine
 def test_slots_do_not_matter():
     """Neither their order nor empty ones."""
     rng = np.random.default_rng(0)
@@ -497,6 +500,7 @@ def test_where_north_is_does_not_matter(make):
         assert 0 < one["rss_lateral"] < 1
 
 
+@pytest.mark.engine
 def test_the_size_of_the_batch_does_not_matter():
     records = [with_empty_slots(random_record(seed)) for seed in range(12)]
     batch = on_host(many(stack(records)))

@@ -40,6 +40,7 @@ from limsim_jax.metrics.traffic import TrafficMetrics, TrafficStep
 from limsim_jax.types import Config, Status
 
 
+@pytest.mark.engine
 def test_plain_columns_are_those_of_the_state():
     for i, (tick, record) in enumerate(seen()):
         state, slot = tick.state, int(tick.state.egos.slot[0])
@@ -59,6 +60,7 @@ def test_plain_columns_are_those_of_the_state():
         assert record.stopped == state.stopped[slot] and ego.off_road == np.asarray(tick.off_road)[slot]
 
 
+@pytest.mark.engine
 def test_bodies_and_vehicles_on_the_same_level():
     there = 0
     for i, (tick, record) in enumerate(seen()):
@@ -257,6 +259,7 @@ def test_maps_where_paths_hardly_or_never_meet():
     assert met > 3
 
 
+@pytest.mark.engine
 def test_vehicles_off_the_road_are_found_where_the_engine_has_not_looked():
     record = jax.jit(lambda tick: EvaluateEgo().record(CONFIG, crossing(), tick._replace(off_road=None)))
     found = []
@@ -378,6 +381,7 @@ def play(slot, ticks, records, metrics):
     return carries, ego, traffic
 
 
+@pytest.mark.engine
 def test_progress_arrival_and_signs_over_time():
     m = host()
     totals = dict.fromkeys(("arrived", "left", "lost", "signs", "pardoned", "changed", "new goal"), 0)
@@ -445,6 +449,7 @@ def test_progress_arrival_and_signs_over_time():
     assert min(totals.values()) > 0, totals
 
 
+@pytest.mark.engine
 def test_metrics_get_the_time_step_and_the_number_of_slots():
     slot, ticks, records = stories()[0]
     _, ego, traffic = play(slot, ticks, records, Seats())
@@ -453,6 +458,7 @@ def test_metrics_get_the_time_step_and_the_number_of_slots():
     assert [one.dt for one in metrics] == [0.05, 0.05]
 
 
+@pytest.mark.engine
 def test_density_is_over_the_length_of_all_lanes():
     slot, ticks, records = stories()[0]
     carries, _, traffic = play(slot, ticks, records, TrafficMetrics(CONFIG.dt))

@@ -102,6 +102,7 @@ def run(r, own: tuple[Metric, ...] = OWN) -> dict[str, Any]:
     return on_host(jax.device_get(program(own)(as_steps(r))))
 
 
+@pytest.mark.engine
 def test_own_metrics_are_further_columns():
     v = np.where(np.arange(31) < 11, 1.0, 5.0)
     leader = {"lead": np.full(31, 1, np.int32), "lead_gap": np.arange(31.0) + 3}
@@ -115,6 +116,7 @@ def test_own_metrics_are_further_columns():
         assert found[name] == (value if value is None else pytest.approx(value, rel=1e-5, abs=1e-5)), name
 
 
+@pytest.mark.engine
 def test_a_value_that_is_not_finite_is_missing():
     found = run(drive())
     assert found["least_gap"] is None and found["neighbours"] == 0.0
@@ -138,6 +140,7 @@ def test_the_description_of_an_own_metric_is_among_all():
     assert list(EvaluateEgo(metrics=OWN).units)[-3:] == ["slow_time", "least_gap", "neighbours"]
 
 
+@pytest.mark.engine
 def test_the_state_of_the_world_is_there_in_a_rollout():
     """Records of random worlds, as a rollout hands them over."""
     ticks = [tick for tick, _ in seen()[:6]]

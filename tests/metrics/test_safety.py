@@ -164,6 +164,7 @@ def test_distances_by_hand():
     assert float(distance(diamond)) == pytest.approx(3.5 - np.sqrt(2), rel=1e-5)
 
 
+@pytest.mark.engine
 def test_gradients_are_finite():
     a, b, va, vb = random_pairs(60, 3)
     b[0], vb[0] = a[0], va[0]  # on top of each other, no relative motion

@@ -278,6 +278,7 @@ def test_limsim_streams_are_loops_over_the_record(seed):
     assert float(corrected.drive) == pytest.approx(expected, rel=2e-3)
 
 
+@pytest.mark.engine
 def test_what_the_corrected_version_corrects():
     n = 61
     steady = record(n)
@@ -317,6 +318,7 @@ def test_what_the_corrected_version_corrects():
     assert (float(faithful.failure), float(corrected.failure)) == pytest.approx((0.6, 1.0))
 
 
+@pytest.mark.engine
 def test_without_a_full_second_there_is_no_limsim_score():
     assert [bool(x.valid) for x in drive(record(10))] == [False, False]
     assert [bool(x.valid) for x in drive(record(15))] == [True, False]  # too short for the jerk's filter

@@ -171,6 +171,7 @@ def test_headways_and_saturation_flow():
     assert by["flow_per_hour"][0, 0] == pytest.approx(3600 * 12 / 49.9, rel=1e-4)
 
 
+@pytest.mark.engine
 def test_who_stops_at_a_detector_has_passed_it_once():
     _, by = run(record([40.0], 10.0, 40), [(0, 50.0)])  # a metre per step: it is there after ten
     assert by["flow_per_hour"][0, 0] == pytest.approx(3600 / 3.9, rel=1e-5)
@@ -183,6 +184,7 @@ def test_the_start_itself_is_no_passage():
     assert by["flow_per_hour"][0, 0] == 0.0 and found["vehicle_km"] == pytest.approx(0.039, rel=1e-4)
 
 
+@pytest.mark.engine
 def test_short_records_and_short_headways():
     """Not a second, and vehicles 0.3 and 0.7 s apart, side by side as on a wide lane."""
     found, by = run(record([49.0, 46.0, 39.0], 10.0, 13), [(0, 50.0)])

@@ -29,6 +29,8 @@ from limsim_jax.traffic.vehicles import (
 )
 from limsim_jax.types import Config
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 PLACES = 4
 

@@ -72,6 +72,7 @@ def follow(seen):
     return {"acceleration": 0 * seen.v, "steering": 0 * seen.v}
 
 
+@pytest.mark.engine
 def test_a_policy_needs_only_the_call():
     lane_map, state = world()
     mine = Cautious()
@@ -84,6 +85,7 @@ def test_a_policy_needs_only_the_call():
         Policy()  # pyright: ignore[reportAbstractUsage]
 
 
+@pytest.mark.engine
 def test_policies_without_the_base_class_are_policies():
     lane_map, state = world()
     assert isinstance(Ducky(), PolicyLike) and isinstance(Cautious(), PolicyLike)

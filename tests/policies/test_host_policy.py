@@ -24,6 +24,8 @@ from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, Scenario
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 N = 4
 calls: list[tuple[int, ...]] = []

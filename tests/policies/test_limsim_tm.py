@@ -6,6 +6,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from traffic_worlds import bundled, drivers, shapes, state_of
 
 from limsim_jax.maps.lane_map import NO_LANE, lane_rows
@@ -28,6 +29,8 @@ from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.vehicles import default_population, restrict_to_map
 from limsim_jax.types import Config
+
+pytestmark = pytest.mark.engine
 
 
 def entrance():

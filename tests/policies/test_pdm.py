@@ -28,6 +28,8 @@ from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 N, K = 8, 6
 P = len(pdm_road.OFFSETS) * len(pdm_proposals.FRACTIONS)

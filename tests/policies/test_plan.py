@@ -25,6 +25,8 @@ from limsim_jax.policies.limsim_tm.plan import (
 from limsim_jax.policies.reference import Frenet, ReferencePath
 from limsim_jax.traffic.car_following import ACC, NO_GAP
 
+pytestmark = pytest.mark.engine
+
 POINTS, STEP = 80, 2.0
 LATTICE = Lattice()
 K = 3

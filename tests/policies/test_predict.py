@@ -22,6 +22,8 @@ from limsim_jax.traffic.ego import Trajectory
 from limsim_jax.traffic.motion import advance, boxes
 from limsim_jax.types import Config
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 TIMES = jnp.arange(9, dtype=jnp.float32) * 0.5
 N = 12

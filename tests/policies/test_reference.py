@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from traffic_worlds import bundled, scattered
 
 from limsim_jax.maps.lane_map import NO_LANE, pose, side_s, width
@@ -19,6 +20,8 @@ from limsim_jax.policies.reference import (
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.motion import advance, boxes
 from limsim_jax.types import Config
+
+pytestmark = pytest.mark.engine
 
 N, POINTS, STEP = 12, 60, 2.0
 

@@ -14,6 +14,8 @@ from limsim_jax.policies.limsim_tm.search import Settings, no_plan, play, search
 from limsim_jax.traffic.car_following import IDM, NO_GAP
 from limsim_jax.traffic.ego import Meta
 
+pytestmark = pytest.mark.engine
+
 SHORT = Settings(decisions=3)
 STEPS = SHORT.steps
 DRIVE = jax.jit(partial(play, SHORT))

@@ -27,6 +27,8 @@ from limsim_jax.traffic.motion import boxes
 from limsim_jax.training import Samples, errors, fit, train
 from limsim_jax.types import Config
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 N = 4
 

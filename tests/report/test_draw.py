@@ -215,6 +215,7 @@ def test_every_lane_is_drawn_with_its_surface(crossing):
     np.testing.assert_allclose(drawn, exact, rtol=2e-3)
 
 
+@pytest.mark.engine
 def test_arrows_point_along_their_lane(crossing):
     arrows = _polygons(draw_network(_axes(), crossing)["arrows"])
     seen = set()
@@ -461,6 +462,7 @@ def test_the_page_says_what_the_map_has(crossing):
     assert not legend & {"parking", "u-turn", "tram, rail", "conflict: cross"}
 
 
+@pytest.mark.engine
 def test_png_shows_the_lanes_where_they_are(crossing, tmp_path):
     figure = draw_map(crossing, tmp_path / "map.png", dpi=80)
     pixels = imread(tmp_path / "map.png")[..., :3]

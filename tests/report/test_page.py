@@ -189,6 +189,7 @@ def test_what_files_say_is_text(tmp_path):
     assert not content.file_name(group[0]).strip("abcdefghijklmnopqrstuvwxyz0123456789_")
 
 
+@pytest.mark.engine
 def test_the_page_does_not_grow_with_the_seeds(tmp_path):
     few, many = (write_report(thousand(n), tmp_path / f"{n}.html") for n in (400, 4000))
     assert "limsim-jax replay results --scenario ramp --seed" in many.read_text()
@@ -231,6 +232,7 @@ def test_intervals_are_drawn_to_scale_and_names_are_text():
 # --- with pictures
 
 
+@pytest.mark.engine
 def test_key_moments_are_pictured_and_replays_written(tmp_path):
     """The ego's outline and the other one's ring are in both pictures, and links lead to files."""
     pytest.importorskip("matplotlib")

@@ -46,6 +46,7 @@ def page(world: Any, tmp_path_factory: Any) -> Path:
     return write_replay(world, tmp_path_factory.mktemp("viewer") / "replay.html")
 
 
+@pytest.mark.engine
 def test_the_file_holds_the_numbers_of_the_trace(world, page):
     network, lane_map, trace = world
     meta, columns = payload(page)
@@ -68,6 +69,7 @@ def test_the_file_holds_the_numbers_of_the_trace(world, page):
     assert west + shift < network.bounds()[0] + 1 and east + shift > network.bounds()[2] - 1
 
 
+@pytest.mark.engine
 def test_an_empty_slot_costs_nothing_and_may_hold_anything(world, tmp_path):
     network, lane_map, trace = world
     box, v = trace.box.copy(), trace.v.copy()
@@ -161,6 +163,7 @@ def test_every_third_step(world, tmp_path):
     np.testing.assert_allclose(columns["s"][SELF], trace.s[::3, SELF], atol=0.006)
 
 
+@pytest.mark.engine
 def test_a_minute_of_64_vehicles_is_less_than_a_megabyte(tmp_path):
     network, lane_map = bundled("long_route")
     rng = np.random.default_rng(0)

@@ -31,6 +31,8 @@ from limsim_jax.traffic.vehicles import (
 )
 from limsim_jax.types import Config
 
+pytestmark = pytest.mark.engine
+
 SLOTS = 24
 RUN = Rollout(Config(dt=0.1), Traffic(), horizon=30.0)
 

@@ -14,6 +14,8 @@ from limsim_jax.sweeps.episode import Episodes, _succeeds
 from limsim_jax.sweeps.experiment import Bounds, ExperimentFile
 from limsim_jax.sweeps.moments import key_moments
 
+pytestmark = pytest.mark.engine
+
 SEEDS = (0, 3, 5)
 SLOTS = 32
 

@@ -10,6 +10,8 @@ from limsim_jax.maps.lane_map import lane_ids
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import ExperimentError, bundled_experiments, read_experiments
 
+pytestmark = pytest.mark.engine
+
 GOOD = """
 map = "intersection"
 horizon = 20.0

@@ -19,6 +19,8 @@ from limsim_jax.sweeps.cluster import sweep_on_ray  # noqa: E402
 from limsim_jax.sweeps.runner import Progress, sweep  # noqa: E402
 from limsim_jax.sweeps.store import open_results  # noqa: E402
 
+pytestmark = pytest.mark.engine
+
 
 @pytest.fixture(scope="module", autouse=True)
 def three_workers():

@@ -145,6 +145,7 @@ def test_shards_have_the_same_files_as_the_whole(tmp_path):
     assert names[0] == names[1]
 
 
+@pytest.mark.engine
 def test_shards_by_processes_at_the_same_time(tmp_path):
     whole = digest_of(tmp_path / "whole", 160)
     out = tmp_path / "out"
@@ -155,6 +156,7 @@ def test_shards_by_processes_at_the_same_time(tmp_path):
     assert len(results.provenance) == 2
 
 
+@pytest.mark.engine
 def test_the_same_shard_by_processes_at_the_same_time(tmp_path):
     """Also on unlike devices: what they write is the same."""
     whole = digest_of(tmp_path / "whole", 80)
@@ -168,6 +170,7 @@ def test_the_same_shard_by_processes_at_the_same_time(tmp_path):
 # --- killed --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.engine
 def test_killed_at_random_moments(tmp_path):
     """Nothing lost, nothing twice, the same digests in the end."""
     whole = digest_of(tmp_path / "whole", 240)
@@ -342,6 +345,7 @@ def test_a_metric_that_was_never_measured_does_not_stop_a_sweep(tmp_path):
     assert not part.reached and part.done == 300
 
 
+@pytest.mark.engine
 def test_kills_do_not_move_the_end(tmp_path):
     """Nor does what was on disk before."""
     goal = 0.05, "success"
@@ -369,6 +373,7 @@ def test_kills_do_not_move_the_end(tmp_path):
     assert set(seeds_of(open_results(out))) == {*range(whole.done), *range(100, 3000, 3)}
 
 
+@pytest.mark.engine
 @pytest.mark.parametrize("p", [0.03, 0.1, 0.5])
 def test_stopping_early_keeps_the_level(p):
     """The share of sweeps whose last interval misses the truth, with looks as in a sweep."""
@@ -523,6 +528,7 @@ def test_verify_of_nothing(tmp_path):
 # --- memory --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.engine
 def test_memory_does_not_grow_with_the_seeds(tmp_path):
     pytest.importorskip("resource")
     code = """

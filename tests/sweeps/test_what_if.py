@@ -14,6 +14,8 @@ from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import EgoTable, ExperimentFile, TrafficTable
 from limsim_jax.sweeps.what_if import stopped
 
+pytestmark = pytest.mark.engine
+
 SEED = 3
 
 

@@ -112,6 +112,7 @@ def test_accelerations_equal_the_plain_formulas(model):
     assert np.mean(error < 1e-9) > 0.99
 
 
+@pytest.mark.engine
 @each_model
 def test_obstacles_are_independent(model):
     driver = make_driver((5,), T=jnp.linspace(1, 2, 5))
@@ -301,6 +302,7 @@ def test_no_equilibrium_at_the_desired_speed():
     np.testing.assert_array_equal(cf.equilibrium_gap(cf.IDM(), make_driver((2,)), v, v0), [cf.NO_GAP] * 2)
 
 
+@pytest.mark.engine
 def test_ring_road_amplifies_as_the_criterion_says():
     """100 vehicles on a ring, one of them 0.5 m/s off, 1500 s: the standard deviation of the speeds."""
     first, stable = SETS[0][0], (HIGHWAY, 1.5, 2.0, 2.0, 1.5)
@@ -507,6 +509,7 @@ def stop_and_go(model, driver, v0, steps, dt=0.1):
     return jnp.stack([gap.mean(), v.mean()]), v
 
 
+@pytest.mark.engine
 @each_model
 def test_gradients_through_a_full_stop(model):
     """d(mean gap, mean speed)/d(parameters), forward and reverse, against central differences."""
@@ -536,6 +539,7 @@ def test_gradients_through_a_full_stop(model):
         assert (jnp.abs(forward) > 1e-4).all(1).any()
 
 
+@pytest.mark.engine
 @each_model
 def test_gradients_are_finite_in_a_standing_queue_with_empty_slots(model):
     """An empty slot holds zeros and overlaps its neighbours; the others stand at s0 or closer."""

@@ -16,6 +16,8 @@ from limsim_jax.traffic.collision import OVERHANG, REACH, contacts
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, Status
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 many_contacts = jax.jit(jax.vmap(contacts))
 

@@ -33,6 +33,8 @@ from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.vehicles import default_population, uniform_population
 from limsim_jax.types import Config
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 CARS = uniform_population()
 

@@ -24,6 +24,8 @@ from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import default_population
 from limsim_jax.types import Config, Schedule
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 let_in = jax.jit(enter, static_argnums=0)
 

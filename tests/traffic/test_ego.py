@@ -19,6 +19,8 @@ from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import advance, boxes
 from limsim_jax.types import Config, Scenario, State
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 N, STEPS = 8, 120
 WHEELBASE = 2.8

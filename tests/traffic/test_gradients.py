@@ -5,11 +5,14 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from traffic_worlds import bundled, scattered
 
 from limsim_jax.traffic.car_following import IDM
 from limsim_jax.traffic.engine import Traffic, drive
 from limsim_jax.types import Config
+
+pytestmark = pytest.mark.engine
 
 CONFIG = Config(dt=0.1)
 TRAFFIC = Traffic(IDM(), lane_changes=False)

@@ -22,6 +22,8 @@ from limsim_jax.traffic.neighbors import (
 )
 from limsim_jax.types import Config
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 
 

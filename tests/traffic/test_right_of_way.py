@@ -30,6 +30,8 @@ from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import default_population
 from limsim_jax.types import Config, Lights
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 
 

@@ -23,6 +23,8 @@ from limsim_jax.traffic.demand import (
 from limsim_jax.traffic.demand.sumo import sumo_scenario
 from limsim_jax.types import Config
 
+pytestmark = pytest.mark.engine
+
 CONFIG = Config(dt=0.1)
 let_in = jax.jit(enter, static_argnums=0)
 

@@ -17,6 +17,8 @@ from limsim_jax.maps.signals import phase_at
 from limsim_jax.maps.sumo import read_demand
 from limsim_jax.traffic.demand.sumo import sumo_scenario
 
+pytestmark = pytest.mark.engine
+
 needs_sumo = pytest.mark.skipif(
     importlib.util.find_spec("libsumo") is None,
     reason="no libsumo; install the dev extra to compare with SUMO",

@@ -35,6 +35,7 @@ def column(population, vehicle_type, name):
     return tuple(float(leaf[vehicle_type, p]) for leaf in leaves)
 
 
+@pytest.mark.engine
 @pytest.mark.parametrize("vehicle_class", ["car", "truck"])
 def test_parameters_have_the_declared_distributions(draw, vehicle_class):
     """Kolmogorov-Smirnov against truncated normals, of the logarithm where the parameter is log-normal."""
@@ -54,6 +55,7 @@ def test_parameters_have_the_declared_distributions(draw, vehicle_class):
         assert stats.kstest(x, stats.truncnorm(low, high, median, spread).cdf).pvalue > 1e-3, name
 
 
+@pytest.mark.engine
 def test_parameters_correlate_as_declared(draw):
     """Normal scores correlate by the product of the loadings, drivers and bodies apart."""
     population = vh.default_population()
@@ -70,6 +72,7 @@ def test_parameters_correlate_as_declared(draw):
     assert want[i["speed_factor"], i["gap_factor"]] < -0.3 and want[i["length"], i["wheelbase"]] > 0.8
 
 
+@pytest.mark.engine
 def test_all_vehicles_are_sensible(draw):
     for shares in (vh.URBAN, vh.HIGHWAY):
         population = vh.default_population(shares)
@@ -96,6 +99,7 @@ def test_classes_without_a_share_do_not_occur(draw):
     assert stats.binomtest(int(counts[1]), N, 0.75).pvalue > 1e-3
 
 
+@pytest.mark.engine
 def test_a_vehicle_does_not_depend_on_its_batch():
     population, key = vh.default_population(), jax.random.key(7)
     sample = jax.jit(vh.sample_vehicles)
@@ -168,6 +172,7 @@ def read_types(tmp_path, text):
     return list(read_demand(path).types.values())
 
 
+@pytest.mark.engine
 def test_vtypes(tmp_path, draw):
     population = vh.from_vtypes(read_types(tmp_path, VTYPES))
     fast, lorry = (draw(population, vehicle_type=row) for row in (0, 1))
