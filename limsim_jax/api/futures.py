@@ -98,6 +98,8 @@ def run_futures(
     if decisions < 1:
         raise ValueError(f"at: {moments.max():g} s; nothing is left of {now.run.horizon:g} s")
     found = []
+    begun = jax.tree.map(lambda x: jnp.repeat(x, count, 0), (now.carry.state, now.carry.memory))
+    copies = jnp.tile(jnp.arange(count), len(moments))
     for policy in policies:
         same, driver, name = _driver(episodes, policy)
         run = replace(now.run, policy=driver, record=trace)
@@ -108,19 +110,14 @@ def run_futures(
             carry = run.restart(now.lane_map, changed, kept)
             return run.advance(now.lane_map, now.schedule, now.key, carry, decisions)[0]
 
-        copies = jax.vmap(one, (None, None, 0))
-        batch = jax.vmap(copies, (0, 0, None))
-        result = jax.device_get(jax.jit(batch)(now.carry.state, now.carry.memory, jnp.arange(count)))
-        kept = jax.tree.map(
-            lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), (result.trace, result.measures)
-        )
-        columns = of_ego(on_host(kept[1]), max(world.ego, 0))
+        result = jax.device_get(jax.jit(jax.vmap(one))(*begun, copies))
+        columns = of_ego(on_host(result.measures), max(world.ego, 0))
         for k in range(len(moments) * count):
             found.append(
                 replace(
                     world,
                     policy=name,
-                    trace=jax.tree.map(lambda x: x[k], kept[0]),  # noqa: B023
+                    trace=jax.tree.map(lambda x: x[k], result.trace),  # noqa: B023
                     metrics={metric: float(np.asarray(x)[k]) for metric, x in columns.items()},
                     moments=[],
                     episodes=None,

@@ -33,6 +33,7 @@ class Headline(NamedTuple):
     statistic: Literal["estimate", "median"] = "estimate"
     unit: str = ""
     scale: float = 1.0
+    plain: bool = False  # only in the list of plain traffic, which has no ego
 
 
 class Plot(NamedTuple):

@@ -115,7 +115,7 @@ class EvaluateEgo:
         rows = state.egos.slot.shape[0]
         if self._last >= rows:
             raise ValueError(f"ego {self._last} is measured, but the world has {rows} egos")
-        first = self._record(lane_map, at_start(state))
+        first = self._record(lane_map, at_start(config, state))
         vehicles = jnp.ones(state.lane.shape[0], bool)
 
         def begin(step: EgoStep, stopped: Bool[Array, ""]) -> EgoState:
@@ -290,7 +290,7 @@ class EvaluateTraffic:
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> TrafficCarry:
         """Everything as it is at the start."""
-        metrics, start = TrafficMetrics(config.dt), at_start(state)
+        metrics, start = TrafficMetrics(config.dt), at_start(config, state)
         first = traffic_step(state, start.left, start.time, start.dx)
         return _flow(metrics, metrics.init(state.lane.shape[0], 0), first)
 

@@ -21,7 +21,7 @@ from limsim_jax.traffic.collision import CLEARANCE, level, off_road
 from limsim_jax.traffic.ego import arrived, body_place
 from limsim_jax.traffic.engine import Tick
 from limsim_jax.traffic.motion import boxes, tails
-from limsim_jax.types import State, Status
+from limsim_jax.types import Config, State, Status
 
 AT_RED = 15.0
 """m before a red light within which a standing ego waits for it."""
@@ -40,11 +40,11 @@ class Snapshot(NamedTuple):
     dx: Float[Array, " N"]  # m travelled in this step
 
 
-def at_start(state: State) -> Snapshot:
-    """A world before its first step."""
+def at_start(config: Config, state: State) -> Snapshot:
+    """A world before the first step that counts: of the world, or of a fork."""
     no = state.active & False
     nothing = jnp.zeros(state.lane.shape[0], jnp.float32)
-    return Snapshot(state, no, no, jnp.zeros((), jnp.float32), nothing)
+    return Snapshot(state, no, no, config.time(state.step), nothing)
 
 
 def after(lane_map: LaneMap, tick: Tick) -> Snapshot:

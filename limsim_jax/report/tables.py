@@ -61,6 +61,7 @@ class Main(NamedTuple):
     statistic: Literal["estimate", "median"] = "estimate"
     unit: str = ""
     scale: float = 1.0
+    plain: bool = False
 
 
 MAIN = tuple(Main(x.name, *x.headline[1:]) for x in headlines() if x.headline)
@@ -273,7 +274,7 @@ def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = 
     several = len({policy for _, policy in order}) > 1
     header = ["", *(f"{scenario} / {policy}" if several else scenario for scenario, policy in order)]
     rows = [["seeds", *(f"{max(r['seeds'] for g, r in found.items() if g[:2] == o):,}" for o in order)]]
-    for main in MAIN:
+    for main in short_list(found):
         cells = [cell(main, found.get((*group, main.metric))) for group in order]
         if any(cells):
             label = f"{main.label}, {main.unit}" if main.unit else main.label
@@ -289,6 +290,12 @@ def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = 
             f"At least, at most: one-sided {100 * level:g} % bounds for what happened in all or none."
         )
     return TextTable(header, rows, notes)
+
+
+def short_list(found: Mapping[tuple[str, str, str], Any]) -> list[Main]:
+    """The main metrics of a summary; those of plain traffic only where there is no ego."""
+    plain = not any(metric == "success" for *_, metric in found)
+    return [main for main in MAIN if plain or not main.plain]
 
 
 def lookup(table: pa.Table) -> dict[tuple[str, str, str], dict[str, Any]]:

@@ -50,7 +50,7 @@ def test_every_ego_has_a_row_of_metrics(results):
         assert by["constant_speed", seed, 0]["digest"] == by["constant_speed", seed, 1]["digest"]
         assert by["constant_speed", seed, 0]["completion"] != by["constant_speed", seed, 1]["completion"]
         for ego in range(2):
-            assert by["constant_speed", seed, ego]["mean_speed"] == pytest.approx(8.0, abs=0.3)
+            assert by["constant_speed", seed, ego]["mean_speed"] == pytest.approx(8.0, abs=0.6)
             assert by["slow", seed, ego]["mean_speed"] < 3.0
 
 
@@ -131,15 +131,15 @@ def test_a_world_is_forked_at_several_moments(results):
     world = results.replay(1, policy="slow")
 
     def faster(state, k):
-        return state.replace(v=state.v.at[state.egos.slot].set(4.0 + k))
+        return state.replace(v=state.v.at[state.egos.slot].set(4.0 + k.astype(jnp.float32)))
 
     kept = lj.ConstantSpeed()  # the speed of the moment
-    futures = world.fork(at=[1.0, 3.0], policies=[kept], count=2, change=faster, seconds=1.0)
+    futures = world.fork(at=[3.0, 4.0], policies=[kept], count=2, change=faster, seconds=1.0)
     rows = futures.table().to_pylist()
-    assert [(row["at"], row["copy"]) for row in rows] == [(1.0, 0), (1.0, 1), (3.0, 0), (3.0, 1)]
+    assert [(row["at"], row["copy"]) for row in rows] == [(3.0, 0), (3.0, 1), (4.0, 0), (4.0, 1)]
     np.testing.assert_allclose([row["mean_speed"] for row in rows], [4, 5, 4, 5], atol=0.3)
-    np.testing.assert_allclose([future.trace.time[0] for future in futures], [1.1, 1.1, 3.1, 3.1], atol=1e-4)
-    assert str(futures) == "4 futures from 1, 3 s on (constant_speed)"
+    np.testing.assert_allclose([future.trace.time[0] for future in futures], [3.1, 3.1, 4.1, 4.1], atol=1e-4)
+    assert str(futures) == "4 futures from 3, 4 s on (constant_speed)"
 
 
 def test_plain_traffic_is_swept():
@@ -151,7 +151,8 @@ def test_plain_traffic_is_swept():
     assert "success" not in found.units and found.episodes.column("traffic_entered").to_pylist()[0] >= 4
     world = found.replay(0)
     assert world.ego == -1 and world.trajectories().num_rows > 100
-    assert "traffic" in str(found)
+    text = str(found)
+    assert "mean speed, m/s" in text and "flow per lane, vehicles/h" in text and "density" in text
 
 
 def test_an_environment_steps_and_batches():

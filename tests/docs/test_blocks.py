@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import doc_blocks
+import jax
 import numpy as np
 import pytest
 from paths import REPO
@@ -50,7 +51,8 @@ def test_blocks_of_a_page_run(page, folder, capsys):
         shutil.copy(found, folder / name)
     names = {"__name__": "__main__"}
     for line, code in page.blocks:
-        exec(compile("\n" * line + code, str(page.path), "exec"), names)
+        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as users have it
+            exec(compile("\n" * line + code, str(page.path), "exec"), names)
     assert "Traceback" not in capsys.readouterr().out
 
 

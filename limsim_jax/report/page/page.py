@@ -45,7 +45,7 @@ from limsim_jax.report.page.content import (
     worst_crash,
     worst_row,
 )
-from limsim_jax.report.tables import MAIN, Group, better, columns, groups, lookup, summary, worst
+from limsim_jax.report.tables import Group, better, columns, groups, lookup, short_list, summary, worst
 from limsim_jax.report.templates import read, render
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ def _replayed(
 
 def _main(parts: Mapping[Group, pa.Table], found: Found) -> list[dict[str, Any]]:
     rows = []
-    for main in MAIN:
+    for main in short_list(found):
         cells = []
         for group in parts:
             row = found.get((*group, main.metric))
@@ -216,7 +216,7 @@ def _main(parts: Mapping[Group, pa.Table], found: Found) -> list[dict[str, Any]]
 
 def _by_scenario(parts: Mapping[Group, pa.Table], found: Found, names: Names) -> list[dict[str, Any]]:
     figures = []
-    for main in MAIN:
+    for main in short_list(found):
         prefix = "median_" if main.statistic == "median" else ""
         points = []
         for group in parts:
