@@ -18,7 +18,7 @@ from pathlib import Path
 
 from paths import REPO
 
-SEEDS = 4
+SEEDS = 2
 
 _BLOCK = re.compile(r"(<!-- block: skip -->\n+)?^```python\n(.*?)^```", re.M | re.S)
 _MANY = re.compile(r"\b(seeds|count|seconds)=(\d[\d_]*)")
