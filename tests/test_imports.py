@@ -105,7 +105,7 @@ def test_public_names_resolve():
     names: list[str] = vars(limsim_jax)["__all__"]
     assert len(names) > 10
     for name in names:
-        assert getattr(limsim_jax, name).__name__ == name
+        assert getattr(limsim_jax, name).__name__.rpartition(".")[2] == name
         assert name in dir(limsim_jax)
     with pytest.raises(AttributeError, match="attribute load_maps"):
         _ = limsim_jax.load_maps  # pyright: ignore[reportAttributeAccessIssue]

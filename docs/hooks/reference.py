@@ -122,6 +122,8 @@ def api() -> str:
 def _home(package: ModuleType, name: str) -> str:
     """The dotted path at which a public name is defined."""
     value = inspect.unwrap(getattr(package, name))
+    if inspect.ismodule(value):
+        return value.__name__
     module, own = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
     if module and own and own.isidentifier() and own in vars(importlib.import_module(module)):
         return f"{module}.{own}"

@@ -111,6 +111,9 @@ class World:
         path.parent.mkdir(parents=True, exist_ok=True)
         place = (path, self.map.network, self.map.lanes, self.trace)
         egos = [] if self.ego < 0 else [self.ego]
+        if suffix in (".gif", ".mp4", ".png"):
+            follow = self.ego if egos and options.get("bounds") is None else None
+            options = {"follow": follow, "egos": egos, "moments": self.moments} | options
         if suffix == ".html":
             from limsim_jax.report.viewer import write_viewer
 
@@ -119,14 +122,12 @@ class World:
         elif suffix in (".gif", ".mp4"):
             from limsim_jax.report.video import write_video
 
-            options = {"follow": self.ego if egos else None, "moments": self.moments} | options
             write_video(*place, **options)
         elif suffix == ".png":
             from limsim_jax.report.video import write_picture
 
             at = self.moments[0]["time"] if self.moments else None
-            options = {"at": at, "follow": self.ego if egos else None, "moments": self.moments} | options
-            write_picture(*place, **options)
+            write_picture(*place, **{"at": at} | options)
         else:
             write_trace(*place)
         return path

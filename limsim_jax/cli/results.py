@@ -12,12 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from limsim_jax.cli.common import window
+
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from limsim_jax.report.tables import TextTable
     from limsim_jax.sweeps.episode import Episodes
     from limsim_jax.sweeps.experiment import ExperimentFile
+    from limsim_jax.sweeps.runner import Progress
     from limsim_jax.sweeps.store import Results
 
 ExperimentArgument = Annotated[
@@ -84,8 +87,8 @@ def sweep(
     from limsim_jax.sweeps.experiment import read_experiments
 
     part, stop = _shard(shard), _until(until_ci)
-    if seeds < 1:
-        raise typer.BadParameter(f"{seeds}; at least 1", param_hint="--seeds")
+    if not 1 <= seeds <= 2**31:
+        raise typer.BadParameter(f"{seeds}; between 1 and 2^31", param_hint="--seeds")
     if chunk is not None and chunk < 1:
         raise typer.BadParameter(f"{chunk}; at least 1", param_hint="--chunk")
     if workers is not None and workers < 1:
@@ -97,19 +100,30 @@ def sweep(
     from limsim_jax.api.progress import progress_bar
     from limsim_jax.sweeps import runner
 
-    with progress_bar() as show:
-        if workers is not None:
-            from limsim_jax.sweeps.cluster import sweep_on_ray
+    kept: dict[tuple[str, str], int] = {}
+    try:
+        with progress_bar() as show:
 
-            factory = functools.partial(build, experiments, chunk, cores=1)
-            summary = sweep_on_ray(
-                factory, range(seeds), folder, workers=workers, address=address, shard=part, until_ci=stop,
-                progress=show,
-            )  # fmt: skip
-        else:
-            summary = runner.sweep(
-                build(experiments, chunk), range(seeds), folder, shard=part, until_ci=stop, progress=show
-            )
+            def tell(now: Progress) -> None:
+                kept[now.scenario, now.policy] = now.done
+                if show is not None:
+                    show(now)
+
+            if workers is not None:
+                from limsim_jax.sweeps.cluster import sweep_on_ray
+
+                factory = functools.partial(build, experiments, chunk, cores=1)
+                summary = sweep_on_ray(
+                    factory, range(seeds), folder, workers=workers, address=address, shard=part,
+                    until_ci=stop, progress=tell,
+                )  # fmt: skip
+            else:
+                summary = runner.sweep(
+                    build(experiments, chunk), range(seeds), folder, shard=part, until_ci=stop, progress=tell
+                )
+    except KeyboardInterrupt:
+        print(f"stopped; {sum(kept.values())} worlds are kept in {folder}; the same command goes on")
+        raise
     ran = sum(found.ran for found in summary.parts)
     for line in summary.damaged:
         print(f"set aside and run again: {line}")
@@ -218,9 +232,21 @@ def replay(
             "  [default: RESULTS/replays/SCENARIO-POLICY-SEED.html]",
         ),
     ] = None,
+    at: Annotated[
+        float | None, typer.Option(help="Moment of a picture, s.  [default: the worst one]")
+    ] = None,
+    begin: Annotated[float | None, typer.Option("--from", help="First moment of a video, s.")] = None,
+    end: Annotated[float | None, typer.Option("--to", help="Last moment of a video, s.")] = None,
+    follow: Annotated[
+        int | None, typer.Option(help="Vehicle that the camera follows, by its slot.  [default: the ego]")
+    ] = None,
+    bounds: Annotated[
+        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="A fixed view of this area instead, m.")
+    ] = None,
 ) -> None:
     """Run one world of the results again and show it."""
     from limsim_jax.api.results import rebuild
+    from limsim_jax.api.world import World
     from limsim_jax.sweeps.store import open_results
 
     opened = open_results(results)
@@ -232,40 +258,37 @@ def replay(
         )
     if not 0 <= seed < 2**31:
         raise typer.BadParameter(f"{seed}; it has to be within 0 and 2^31 - 1", param_hint="--seed")
+    moving, still = path.suffix in (".gif", ".mp4"), path.suffix == ".png"
+    options = {
+        "--at": (at, still), "--from": (begin, moving), "--to": (end, moving),
+        "--follow": (follow, still or moving), "--bounds": (bounds, still or moving),
+    }  # fmt: skip
+    for name, (value, fits) in options.items():
+        if value is not None and not fits:
+            raise typer.BadParameter(f"not for {path.suffix} files", param_hint=name)
+    area = None if bounds is None else window(bounds)
+    if area is not None and follow is not None:
+        raise typer.BadParameter(
+            "a view is fixed or follows a vehicle; leave out --follow", param_hint="--bounds"
+        )
     stored = _stored(opened, group, seed)
     if stored is None:
         print(f"note: the results hold no seed {seed} of {group[0]} ({group[1]}); it is run now")
     path.parent.mkdir(parents=True, exist_ok=True)
-    network, lane_map, trace, ego, moments, metrics = rebuild(opened, *group).replay(seed)
-    for row in moments:
+    world = World.run(rebuild(opened, *group), seed)
+    for row in world.moments:
         value = "" if math.isnan(row["value"]) else f", {row['value']:.2f}"
         who = f", responsible: {row['responsible']}" if row["responsible"] else ""
         able = [name for name in ("ego", "other") if row.get(f"avoidable_by_{name}")]
         saved = f", had braked in time, would have avoided it: {' or '.join(able)}" if able else ""
         module = f", avoided by a reference {row['module']} module" if row.get("module") else ""
         print(f"{row['time']:6.1f} s  {row['kind']}{value}{who}{saved}{module}")
-    if stored is not None and (differs := [x for x in metrics if not _alike(metrics[x], stored[x])]):
+    if stored is not None and (
+        differs := [x for x, value in world.metrics.items() if not _alike(value, stored[x])]
+    ):
         print(f"note: not the episode that is stored: {', '.join(differs[:3])} differ; 'verify' may tell why")
-    match path.suffix:
-        case ".html":
-            from limsim_jax.report.viewer import write_viewer
-
-            write_viewer(
-                path, network, lane_map, trace, ego=ego, moments=moments, title=f"{group[0]}, seed {seed}"
-            )
-        case ".gif" | ".mp4":
-            from limsim_jax.report.video import write_video
-
-            write_video(path, network, lane_map, trace, follow=ego, moments=moments)
-        case ".png":
-            from limsim_jax.report.video import write_picture
-
-            at = moments[0]["time"] if moments else None
-            write_picture(path, network, lane_map, trace, at, follow=ego, moments=moments)
-        case _:
-            from limsim_jax.simulation.table import write_trace
-
-            write_trace(path, network, lane_map, trace)
+    given = {"at": at, "begin": begin, "end": end, "follow": follow, "bounds": area}
+    world.save(path, **{name: value for name, value in given.items() if value is not None})
     print(f"wrote {path}")
 
 
@@ -316,7 +339,10 @@ def _shard(text: str | None) -> tuple[int, int] | None:
         return None
     first, slash, second = text.partition("/")
     if not (slash and first.isdecimal() and second.isdecimal()) or int(first) >= int(second):
-        raise typer.BadParameter(f"'{text}'; as 0/4, 1/4, 2/4, 3/4", param_hint="--shard")
+        raise typer.BadParameter(
+            f"'{text}' is not I/N with I below N; the four parts of a sweep are 0/4, 1/4, 2/4 and 3/4",
+            param_hint="--shard",
+        )
     return int(first), int(second)
 
 

@@ -1,1 +1,5 @@
 """What a run looks like: pictures and videos."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, submodules=["plots"])

@@ -185,7 +185,10 @@ def _pairs(
     if not pairs:
         wanted = f"policies {policies[0]} and {policies[1]}" if policies else "no pair of policies"
         known = ", ".join(sorted({p for some in (*own.values(), *others.values()) for p in some}))
-        raise ValueError(f"{wanted} to compare in {a.path} and {b.path}; name two of {known}")
+        if same and policies is None and all(len(found) == 1 for found in own.values()):
+            raise ValueError(f"{a.path} holds one policy, {known}; give the results of another one, too")
+        where = f"{a.path}" if same else f"{a.path} and {b.path}"
+        raise ValueError(f"{wanted} to compare in {where}; name two of {known}")
     return pairs
 
 

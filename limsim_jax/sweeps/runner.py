@@ -335,11 +335,11 @@ def _interval(values: Sequence[float], share: bool, level: float) -> Interval:
 
 
 def _checked_seeds(seeds: Sequence[int]) -> list[int]:
-    found = [int(seed) for seed in seeds]
-    if not found:
+    if len(seeds) == 0:
         raise ValueError("no seeds; at least one is needed")
-    if min(found) < 0 or max(found) >= 2**31:
-        raise ValueError(f"seeds from {min(found)} to {max(found)}; they must be within 0 and 2^31 - 1")
+    if min(seeds) < 0 or max(seeds) >= 2**31:  # before a long range becomes a list
+        raise ValueError(f"seeds from {min(seeds)} to {max(seeds)}; they must be within 0 and 2^31 - 1")
+    found = [int(seed) for seed in seeds]
     if len(set(found)) < len(found):
         twice = next(a for a, b in itertools.pairwise(sorted(found)) if a == b)
         raise ValueError(f"seed {twice} is there twice; every world counts once")

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 import limsim_jax as lj
 from limsim_jax import cli
 from limsim_jax.maps import bundled_map, bundled_maps, read_network
+from limsim_jax.sweeps import runner
 
 LANES = """
 <lanes><laneSection s="0"><center><lane id="0" type="none"/></center><right>
@@ -229,6 +230,11 @@ REFUSALS = {
     "bench of no policy": ("bench policy ramp --policy no_such", "unknown policy 'no_such'"),
     "bench of many policies": ("bench policy paper", "'paper' is 5 experiments"),
     "bench with a bad rate": ("bench traffic ok.xodr --rate -2", "--rate"),
+    "seeds beyond 32 bits": ("sweep paper --seeds 99999999999", "between 1 and 2^31"),
+    "no seeds": ("sweep paper --seeds 0", "between 1 and 2^31"),
+    "a part that is none": ("sweep paper --shard 3/2", "'3/2' is not I/N with I below N"),
+    "module of a policy": ("sweep paper --policy none:Mine", "looked in the Python path and in"),
+    "replay of nothing": ("replay folder --seed 0", "folder"),
     "bench JSON folder": ("bench traffic ok.xodr --json nowhere/x.json", "nowhere/x.json"),
 }
 
@@ -255,6 +261,18 @@ def test_load_map_refuses_with_one_line(content, tmp_path):
     with pytest.raises(lj.MapError) as caught:
         read_network(tmp_path / "map.xodr")
     assert "\n" not in str(caught.value) and "map.xodr" in str(caught.value)
+
+
+def test_a_sweep_that_is_stopped_says_what_is_kept(run, tmp_path, monkeypatch):
+    def stopped(episodes, seeds, out, *, progress, **_):
+        for policy, done in (("like_traffic", 16), ("like_traffic", 48), ("mine", 5)):
+            progress(runner.Progress("roundabout", policy, "running", done, 100, 0.0, 0.0, 1.0, 1.0))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runner, "sweep", stopped)
+    code, out, err = run("sweep", "roundabout", "--out", tmp_path)
+    assert code == 130 and err == ""
+    assert out.splitlines()[-1] == f"stopped; 53 worlds are kept in {tmp_path}; the same command goes on"
 
 
 def test_bug_is_a_traceback(run, write, monkeypatch):

@@ -114,7 +114,7 @@ def test_two_policies_of_one_directory():
     assert rows_of(compare(both, policies=("mcts", "idm")))["success"]["a_not_b"] == 2
     with pytest.raises(ValueError, match=r"policies idm and rl to compare .*; name two of idm, mcts"):
         compare(both, policies=("idm", "rl"))
-    with pytest.raises(ValueError, match="no pair of policies"):
+    with pytest.raises(ValueError, match="holds one policy, idm; give the results of another one"):
         compare(made({A: columns}))
 
 
