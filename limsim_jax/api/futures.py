@@ -13,12 +13,11 @@ import pyarrow as pa
 
 from limsim_jax.api.world import World
 from limsim_jax.metrics.reductions import on_host
-from limsim_jax.policies.base import PolicyLike, policy_name
-from limsim_jax.simulation.trace import trace
+from limsim_jax.policies.base import PolicyLike, named
 from limsim_jax.sweeps.build import policy_of
 from limsim_jax.sweeps.experiment import with_policy
 from limsim_jax.sweeps.reruns import of_ego
-from limsim_jax.sweeps.what_if import stopped
+from limsim_jax.sweeps.what_if import futures, stopped
 
 if TYPE_CHECKING:
     from limsim_jax.sweeps.episode import Episodes
@@ -90,49 +89,41 @@ def run_futures(
     episodes = world.episodes
     assert episodes is not None
     moments = np.atleast_1d(np.asarray(at, float))
-    now = stopped(episodes, world.seed, moments.tolist())
-    every = now.run.config.decision_time
-    begin = np.round(moments / every)
-    left = now.run.decisions - int(begin.max())
+    begun, begin = stopped(episodes, world.seed, moments.tolist())
+    run = episodes.rollout
+    every = run.config.decision_time
+    left = run.decisions - max(begin)
     decisions = left if seconds is None else min(left, max(1, round(seconds / every)))
     if decisions < 1:
-        raise ValueError(f"at: {moments.max():g} s; nothing is left of {now.run.horizon:g} s")
+        raise ValueError(f"at: {moments.max():g} s; nothing is left of {run.horizon:g} s")
+    begun = jax.tree.map(lambda x: jnp.repeat(x, count, 0), begun)
+    copies = np.tile(np.arange(count, dtype=np.int32), len(moments))
     found = []
-    begun = jax.tree.map(lambda x: jnp.repeat(x, count, 0), (now.carry.state, now.carry.memory))
-    copies = jnp.tile(jnp.arange(count), len(moments))
     for policy in policies:
-        same, driver, name = _driver(episodes, policy)
-        run = replace(now.run, policy=driver, record=trace)
-
-        def one(state: State, memory: Any, k: Any, run: Any = run, same: bool = same) -> Any:
-            changed = state if change is None else change(state, k)
-            kept = memory if same else run.policy.init(run.config, now.lane_map, changed)
-            carry = run.restart(now.lane_map, changed, kept)
-            return run.advance(now.lane_map, now.schedule, now.key, carry, decisions)[0]
-
-        result = jax.device_get(jax.jit(jax.vmap(one))(*begun, copies))
+        same = policy is None
+        driven = episodes if policy is None else episodes.under(_driver(episodes, policy))
+        result = futures(driven, begun, decisions, same=same, change=change, copies=copies)
         columns = of_ego(on_host(result.measures), max(world.ego, 0))
         for k in range(len(moments) * count):
             found.append(
                 replace(
                     world,
-                    policy=name,
+                    policy=driven.policy,
                     trace=jax.tree.map(lambda x: x[k], result.trace),  # noqa: B023
                     metrics={metric: float(np.asarray(x)[k]) for metric, x in columns.items()},
                     moments=[],
                     episodes=None,
                 )
             )
-    return Futures(found, np.tile(np.repeat(begin * every, count), len(policies)).tolist())
+    at_each = np.repeat(np.asarray(begin) * every, count)
+    return Futures(found, np.tile(at_each, len(policies)).tolist())
 
 
-def _driver(episodes: Episodes, policy: PolicyLike | str | None) -> tuple[bool, PolicyLike, str]:
-    """Whether it is the policy of before, the policy, and its name."""
-    if policy is None:
-        return True, episodes.rollout.policy, episodes.policy
-    if isinstance(policy, str):
-        file = episodes.experiment
-        egos = [ego.model_dump() for ego in file.ego]
-        named = type(file).model_validate(file.model_dump() | {"ego": with_policy(egos, policy, file.name)})
-        return False, policy_of(named), named.policy
-    return False, policy, policy_name(policy)
+def _driver(episodes: Episodes, policy: PolicyLike | str) -> PolicyLike:
+    """The policy itself, or the one of this name."""
+    if not isinstance(policy, str):
+        return policy
+    file = episodes.experiment
+    egos = [ego.model_dump() for ego in file.ego]
+    found = type(file).model_validate(file.model_dump() | {"ego": with_policy(egos, policy, file.name)})
+    return named(found.policy, policy_of(found))

@@ -127,7 +127,8 @@ class World:
             from limsim_jax.report.video import write_picture
 
             at = self.moments[0]["time"] if self.moments else None
-            write_picture(*place, **{"at": at} | options)
+            options = {"at": at} | options
+            write_picture(*place, **options)
         else:
             write_trace(*place)
         return path

@@ -41,7 +41,7 @@ IN_SWEEP = 6
 """Worst episodes with pictures in the report at the end of a sweep."""
 
 SECONDS = 60.0
-"""s after which such a report begins no further replay: each scenario costs a compilation."""
+"""s after which such a report replays no further scenario."""
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -101,6 +101,7 @@ def sweep(
     from limsim_jax.sweeps import runner
 
     kept: dict[tuple[str, str], int] = {}
+    made = build(experiments, chunk) if workers is None else []
     try:
         with progress_bar() as show:
 
@@ -118,9 +119,7 @@ def sweep(
                     until_ci=stop, progress=tell,
                 )  # fmt: skip
             else:
-                summary = runner.sweep(
-                    build(experiments, chunk), range(seeds), folder, shard=part, until_ci=stop, progress=tell
-                )
+                summary = runner.sweep(made, range(seeds), folder, shard=part, until_ci=stop, progress=tell)
     except KeyboardInterrupt:
         print(f"stopped; {sum(kept.values())} worlds are kept in {folder}; the same command goes on")
         raise
@@ -137,7 +136,7 @@ def sweep(
     if part is None:
         opened, table = _print_headline(folder)
         if html:
-            _write_report(opened, table, folder / "report.html", IN_SWEEP, SECONDS)
+            _write_report(opened, table, folder / "report.html", IN_SWEEP, SECONDS, made)
 
 
 def report(
@@ -392,17 +391,23 @@ def _print_table(table: TextTable) -> None:
 
 
 def _write_report(
-    results: Results, table: pa.Table, path: Path, worst: int, seconds: float = math.inf
+    results: Results,
+    table: pa.Table,
+    path: Path,
+    worst: int,
+    seconds: float = math.inf,
+    made: Sequence[Episodes] = (),
 ) -> None:
+    """`made`: worlds that are compiled already."""
     from limsim_jax.api.results import rebuild
     from limsim_jax.report.page import write_report
 
-    @functools.cache
-    def episodes(scenario: str, policy: str) -> Episodes:
-        return rebuild(results, scenario, policy)
+    known = {(one.scenario, one.policy): one for one in made}
 
-    def again(scenario: str, policy: str, seed: int) -> tuple[Any, ...]:
-        return episodes(scenario, policy).replay(seed)
+    def again(scenario: str, policy: str, seeds: Sequence[int]) -> Sequence[tuple[Any, ...]]:
+        group = scenario, policy
+        episodes = known[group] if group in known else rebuild(results, *group)
+        return episodes.replays([(seed, 0) for seed in seeds])
 
     write_report(results, path, replayer=again, worst=worst, seconds=seconds, say=print, table=table)
     print(f"wrote {path}")

@@ -127,9 +127,12 @@ class Rollout:
         schedule: Schedule,
         key: Key[Array, ""],
         carry: Carry,
-        decisions: int | None = None,
+        decisions: int | Int[Array, ""] | None = None,
     ) -> tuple[Result, Carry]:
         """Run on to the horizon or for a number of decisions.
+
+        One program serves all numbers if the number is an array. It keeps the records of the last decision
+        only, `[decision_every, ...]`, and has no gradient in reverse.
 
         Returns the result, and the carry to run on from there."""
         config, measure = self.config, self.measure
@@ -156,8 +159,14 @@ class Rollout:
             return new, kept
 
         length = self.decisions if decisions is None else decisions
-        carry, records = lax.scan(decide, carry, None, length=length)
-        records = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
+        if isinstance(length, int):
+            carry, records = lax.scan(decide, carry, None, length=length)
+            records = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
+        else:
+            once = jax.jit(decide)  # traced once for both uses
+            shapes = jax.eval_shape(once, carry, None)[1]
+            none = mapped_like(carry.state.s, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+            carry, records = lax.fori_loop(0, length, lambda _, both: once(both[0], None), (carry, none))
         late = delayed(schedule, carry.state, config.time(carry.state.step))
         carry = carry._replace(totals=replace(carry.totals, waiting=jnp.sum(late, dtype=jnp.int32)))
         found = None if measure is None else measure.result(config, lane_map, carry.measured)

@@ -24,9 +24,9 @@ from limsim_jax.xla import enable_compilation_cache, run_once
 
 
 def over_worlds(
-    one: Callable[[LaneMap, Any], Any], mesh: Mesh, compiler_options: dict[str, Any] | None = None
+    one: Callable[[Any, Any], Any], mesh: Mesh, compiler_options: dict[str, Any] | None = None
 ) -> Any:
-    """A function of one world, jitted for `[B, ...]` worlds.
+    """A function of what all worlds share and of one world, jitted for `[B, ...]` worlds.
 
     The batch is divided among the devices of the mesh."""
     everywhere, worlds = PartitionSpec(), PartitionSpec("worlds")
@@ -44,8 +44,10 @@ def over_worlds(
 class Worlds:
     """Many worlds of one shape: compiled once, run in chunks over all local devices.
 
+    The same program runs whole chunks, and worlds decision by decision for a closer look.
+
     Args:
-      run: the rollout.
+      run: the rollout. What it records is there for `replay`.
       lane_map: where.
       sampler: scenario of a world from its key; of the same shapes for all keys.
       chunk: worlds per call; rounded up to a multiple of the number of devices.
@@ -67,12 +69,15 @@ class Worlds:
         self.chunk = -(-chunk // len(devices)) * len(devices)
         self.mesh = Mesh(np.array(devices), ("worlds",))
         self.lane_map = jax.device_put(lane_map, NamedSharding(self.mesh, PartitionSpec()))
+        self.rollout = run
 
         def start(lane_map: LaneMap, seed: Int[Array, ""]) -> Started:
             return started(run, lane_map, sampler, seed)
 
-        def advance(lane_map: LaneMap, world: Started) -> Result:
-            return run.advance(lane_map, *world)[0]
+        def advance(shared: tuple[LaneMap, Int[Array, ""]], world: Started) -> tuple[Started, Result]:
+            lane_map, decisions = shared
+            result, carry = run.advance(lane_map, *world, decisions)
+            return world._replace(carry=carry), result
 
         self._start: Any = over_worlds(start, self.mesh, run_once())
         self._advance: Any = over_worlds(advance, self.mesh)
@@ -84,25 +89,86 @@ class Worlds:
         with ThreadPoolExecutor(1) as pool, no_garbage_collection():
             start = self._start.lower(self.lane_map, seeds)
             compiled = pool.submit(start.compile)  # while the other is traced and compiled
-            self._advance = self._advance.lower(self.lane_map, start.out_info).compile()
+            self._advance = self._advance.lower((self.lane_map, np.int32(0)), start.out_info).compile()
             self._start = compiled.result()
         return self
 
+    def start(self, seeds: Sequence[int]) -> Started:
+        """At most `chunk` worlds before their first decision, on the devices; the last one fills the chunk.
+
+        Raises:
+          ValueError: no seeds, too many, or one below 0 or beyond 2^31 - 1.
+        """
+        _check(seeds)
+        if len(seeds) > self.chunk:
+            raise ValueError(f"{len(seeds)} seeds at once; at most {self.chunk}")
+        enable_compilation_cache()
+        padded = np.array([*seeds, *[seeds[-1]] * (self.chunk - len(seeds))], np.int32)
+        return self._start(self.lane_map, padded)
+
+    def advance(self, worlds: Started, decisions: int) -> tuple[Started, Result]:
+        """A chunk some decisions later, on the devices.
+
+        Records of the result are those of the last decision."""
+        return self._advance((self.lane_map, np.int32(decisions)), worlds)
+
+    def run(self, worlds: Started) -> Result:
+        """Worlds `[W, ...]` from their start to the horizon, on the host."""
+
+        def run(chunk: Started, _: int) -> Result:
+            result = self.advance(chunk, self.rollout.decisions)[1]
+            return jax.device_get(result._replace(trace=None))
+
+        return self._in_chunks(worlds, run)
+
+    def replay(self, worlds: Started, decisions: int | None = None) -> Result:
+        """Worlds `[W, ...]` for some decisions, or from their start to the horizon, on the host.
+
+        Records are those of every step, `[W, T, ...]`. All else is the same as in `run`, to the last bit.
+        """
+
+        def run(chunk: Started, count: int) -> Result:
+            result, records = None, []
+            for _ in range(self.rollout.decisions if decisions is None else decisions):
+                chunk, result = self.advance(chunk, 1)
+                records.append(jax.tree.map(lambda x: x[:count], jax.device_get(result.trace)))
+            assert result is not None
+            whole = jax.device_get(result._replace(trace=None))
+            return whole._replace(trace=jax.tree.map(lambda *x: np.concatenate(x, 1), *records))
+
+        return self._in_chunks(worlds, run)
+
+    def _in_chunks(self, worlds: Started, run: Callable[[Started, int], Result]) -> Result:
+        """Whole chunks, one after the other; the last world fills the last one."""
+        there = NamedSharding(self.mesh, PartitionSpec("worlds"))
+        count = len(worlds.carry.state.step)
+        parts = []
+        for first in range(0, count, self.chunk):
+            some = min(self.chunk, count - first)
+            which = np.minimum(np.arange(first, first + self.chunk), count - 1)
+            chunk = worlds
+            if some < count or some < self.chunk:
+                chunk = jax.device_put(jax.tree.map(lambda x: x[which], worlds), there)  # noqa: B023
+            result = run(chunk, some)
+            parts.append(jax.tree.map(lambda x: x[:some], result))  # noqa: B023
+        return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
     def chunks(self, seeds: Sequence[int]) -> Iterator[tuple[Sequence[int], Result]]:
         """Chunk by chunk: its seeds, and the results `[len(seeds), ...]` on the host."""
-        seeds = list(seeds)
-        if not seeds:
-            raise ValueError("no seeds; at least one is needed")
-        if min(seeds) < 0 or max(seeds) >= 2**31:
-            raise ValueError(f"seeds from {min(seeds)} to {max(seeds)}; they must be within 0 and 2^31 - 1")
-        enable_compilation_cache()
+        _check(seeds)
         for first in range(0, len(seeds), self.chunk):
             some = seeds[first : first + self.chunk]
-            padded = np.array(some + [some[-1]] * (self.chunk - len(some)), np.int32)
-            result = jax.device_get(self._advance(self.lane_map, self._start(self.lane_map, padded)))
+            result = self.run(self.start(some))  # whole chunks, so that no array is copied
             yield some, jax.tree.map(lambda x: x[: len(some)], result)  # noqa: B023
 
     def run_totals(self, seeds: Sequence[int]) -> Totals:
         """Totals of all worlds `[len(seeds)]`, on the host."""
         parts = [result.totals for _, result in self.chunks(seeds)]
         return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def _check(seeds: Sequence[int]) -> None:
+    if len(seeds) == 0:
+        raise ValueError("no seeds; at least one is needed")
+    if min(seeds) < 0 or max(seeds) >= 2**31:
+        raise ValueError(f"seeds from {min(seeds)} to {max(seeds)}; they must be within 0 and 2^31 - 1")

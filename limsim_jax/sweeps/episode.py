@@ -27,9 +27,10 @@ from limsim_jax.metrics.catalog import TOTALS
 from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos, EvaluateTraffic
 from limsim_jax.metrics.reductions import on_host
-from limsim_jax.policies.base import PolicyLike, check_policy
+from limsim_jax.policies.base import PolicyLike, check_policy, policy_name
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.totals import Totals
+from limsim_jax.simulation.trace import trace
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweeps.build import (
     demand_of,
@@ -42,7 +43,7 @@ from limsim_jax.sweeps.build import (
 )
 from limsim_jax.sweeps.experiment import NO_POLICY, Bounds, ExperimentError, ExperimentFile
 from limsim_jax.sweeps.moments import key_moments
-from limsim_jax.sweeps.reruns import Replay, Reruns
+from limsim_jax.sweeps.reruns import CanBrake, Replay, Reruns
 from limsim_jax.sweeps.store import Outcome
 from limsim_jax.traffic.car_following import CarFollowing
 from limsim_jax.traffic.demand import Flow, sample_scenario
@@ -60,7 +61,7 @@ _NO_PART_OF_ROWS = ("api", "bench", "bench.py", "cli", "report")
 
 
 class Episodes:
-    """Runs an experiment, chunk by chunk; `rollout`, `lane_map` and `sample` are what it is made of.
+    """Runs an experiment, chunk by chunk. Its parts: `rollout`, `lane_map`, `sample`, `worlds`.
 
     Args:
       experiment: the file's tables.
@@ -106,8 +107,9 @@ class Episodes:
         self._check_policy()
         self.world_bytes = self._memory()
         self.chunk = self._chunk() if chunk is None else chunk
-        self._worlds = Worlds(self.rollout, self.lane_map, self.sample, chunk=self.chunk)
-        self.chunk = self._worlds.chunk
+        run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
+        self.worlds = Worlds(run, self.lane_map, self.sample, chunk=self.chunk)
+        self.chunk = self.worlds.chunk
 
     @property
     def egos(self) -> int:
@@ -133,6 +135,13 @@ class Episodes:
     def lane_map(self) -> LaneMap:
         """The map on the device."""
         return self.town.lanes
+
+    def under(self, policy: PolicyLike) -> Episodes:
+        """The same worlds under another policy."""
+        values: dict[str, Any] = self._values | {"policy": policy}
+        return Episodes(
+            self.experiment, chunk=self.chunk, town=self.town, name=policy_name(policy), **values
+        )  # fmt: skip
 
     def _measures(self, metrics: tuple[Metric, ...]) -> EvaluateEgo | EvaluateTraffic:
         if not self.egos:
@@ -243,13 +252,13 @@ class Episodes:
 
     def compile(self) -> None:
         """Compile now; otherwise the first chunk does."""
-        self._worlds.compile()
+        self.worlds.compile()
 
     def run(self, seeds: Sequence[int]) -> Outcome:
         """Run at most `chunk` worlds."""
         if len(seeds) > self.chunk:
             raise ValueError(f"{len(seeds)} seeds at once; at most {self.chunk}")
-        (_, result), *_ = self._worlds.chunks(seeds)
+        (_, result), *_ = self.worlds.chunks(seeds)
         metrics = self._columns(result.measures, result.totals)
         each = max(self.egos, 1)
         rows = np.repeat(np.asarray(seeds, np.int64), each)
@@ -276,30 +285,54 @@ class Episodes:
 
     @cached_property
     def _reruns(self) -> Reruns:
-        return Reruns(self.rollout, self.lane_map, self.sample)
+        return Reruns(self.worlds, self.rollout)
 
     def replay(self, seed: int, ego: int = 0, *, explain: bool = True) -> Replay:
-        """Run one world again and keep every step.
+        """Run one world again and keep every step: see `replays`."""
+        return self.replays([(seed, ego)], explain=explain)[0]
+
+    def replays(self, which: Sequence[tuple[int, int]], *, explain: bool = True) -> list[Replay]:
+        """Run worlds again and keep every step. They are those of the sweep, to the last bit.
 
         Args:
-          seed: of the world.
-          ego: whose metrics and key moments.
+          which: seeds and egos, whose metrics and key moments are wanted.
           explain: find out which vehicle or module could have avoided the worst moment: see
-            `Reruns.explain`.
+            `Reruns.avoidable` and `Reruns.module`.
         """
-        if not 0 <= ego < max(self.egos, 1):
-            raise ValueError(f"ego {ego}: the experiment has egos 0 to {self.egos - 1}")
-        result = self._reruns.run(seed)
-        metrics = self._columns(result.measures, result.totals)
-        metrics = {name: x[ego : ego + 1] for name, x in metrics.items()}
-        moments = key_moments(np.asarray([seed], np.int64), np.asarray([ego], np.int32), metrics)
-        columns = {name: column.tolist() for name, column in moments.items()}
-        rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-        found = {name: float(x[0]) for name, x in metrics.items()}
-        worst = rows[0]["kind"] if rows else None
-        if explain and worst in ("contact", "off_road", "red_light"):
-            rows[0] |= self._reruns.explain(seed, ego, found, worst, result.trace)
-        return Replay(self.network, self.lane_map, result.trace, ego if self.egos else -1, rows, found)
+        for _, ego in which:
+            if not 0 <= ego < max(self.egos, 1):
+                raise ValueError(f"ego {ego}: the experiment has egos 0 to {self.egos - 1}")
+        result = self._reruns.replay([seed for seed, _ in which])
+        columns = self._columns(result.measures, result.totals)
+        found = []
+        for k, (seed, ego) in enumerate(which):
+            row = k * max(self.egos, 1) + ego
+            metrics = {name: x[row : row + 1] for name, x in columns.items()}
+            moments = key_moments(np.asarray([seed], np.int64), np.asarray([ego], np.int32), metrics)
+            table = {name: column.tolist() for name, column in moments.items()}
+            rows = [dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True)]
+            seen = jax.tree.map(lambda x: x[k], result.trace)  # noqa: B023
+            values = {name: float(x[0]) for name, x in metrics.items()}
+            slot = ego if self.egos else -1
+            found.append(Replay(self.network, self.lane_map, seen, slot, rows, values))
+        if explain:
+            self._explain([seed for seed, _ in which], found)
+        return found
+
+    def _explain(self, seeds: Sequence[int], found: Sequence[Replay]) -> None:
+        """Add to the worst moments what could have avoided them."""
+        failed = [
+            (seed, one)
+            for seed, one in zip(seeds, found, strict=True)
+            if one.moments and one.moments[0]["kind"] in ("contact", "off_road", "red_light")
+        ]
+        contacts = [(seed, one) for seed, one in failed if one.moments[0]["kind"] == "contact"]
+        able = self._reruns.avoidable([(seed, one.ego, one.metrics) for seed, one in contacts])
+        for (_, one), said in zip(contacts, able, strict=True):
+            one.moments[0] |= said
+        for seed, one in failed:
+            kind = one.moments[0]["kind"]
+            one.moments[0]["module"] = self._reruns.module(seed, one.ego, one.metrics, kind, one.trace)
 
 
 @cache

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.network import Network
@@ -17,11 +19,11 @@ from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import Rss
 from limsim_jax.policies.base import PolicyLike, variants
 from limsim_jax.policies.predict import Replayed, constant_velocity
-from limsim_jax.simulation.rollout import Carry, Result, Rollout, Sampler, Started, started
-from limsim_jax.simulation.trace import Trace, trace
+from limsim_jax.simulation.rollout import Result, Rollout, Started
+from limsim_jax.simulation.trace import Trace
+from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, State
-from limsim_jax.xla import enable_compilation_cache, run_once
 
 UNSAFE = 4.0
 """s before a contact at which braking may have begun, at most."""
@@ -38,50 +40,90 @@ class Replay(NamedTuple):
     metrics: dict[str, float]
 
 
+class Changed(NamedTuple):
+    """A world to run again: the vehicle in `slot` brakes as hard as it can from `at` s on."""
+
+    seed: int
+    slot: int = -1
+    at: float = math.inf
+
+
 class Reruns:
-    """Runs single worlds of a rollout again, with changes.
+    """Runs worlds of a sweep again, with changes, by the program of the sweep.
 
     Args:
-      rollout: of the sweep, with its policy and measure.
-      lane_map: where.
-      sample: scenario of a world from its key.
+      worlds: of a rollout that records `simulation.trace.trace` and whose policy is a `CanBrake`.
+      rollout: the same, with the policy alone.
     """
 
-    def __init__(self, rollout: Rollout, lane_map: LaneMap, sample: Sampler) -> None:
-        self.rollout, self.lane_map, self.policy = rollout, lane_map, rollout.policy
-
-        def start(lane_map: LaneMap, seed: jax.Array) -> Started:
-            return started(rollout, lane_map, sample, seed)
-
-        def advance(lane_map: LaneMap, world: Started, slot: jax.Array, at: jax.Array) -> Result:
-            run = replace(rollout, record=trace, policy=_Braking(rollout.policy, slot, at))
-            return run.advance(lane_map, *world)[0]
-
-        enable_compilation_cache()
-        self._start = jax.jit(start, compiler_options=run_once())
-        self._advance = jax.jit(advance)
+    def __init__(self, worlds: Worlds, rollout: Rollout) -> None:
+        self.worlds, self.rollout = worlds, rollout
         self._references = {
             module: jax.jit(partial(self._with_reference, module))
             for module in variants(rollout.policy, constant_velocity)
         }
 
-    def run(self, seed: int, slot: int = -1, at: float = np.inf) -> Result:
-        """One world with its trace; the vehicle in `slot` brakes as hard as it can from `at` s on."""
-        world = self._start(self.lane_map, np.int32(seed))
-        result = jax.device_get(self._advance(self.lane_map, world, np.int32(slot), np.float32(at)))
-        single = jax.tree.map(lambda x: x[None], (result.measures, result.totals))
-        return result._replace(measures=single[0], totals=single[1])
+    def replay(self, seeds: Sequence[int]) -> Result:
+        """Worlds with their traces, `[W, T, ...]`."""
+        return self._in_chunks(list(map(Changed, seeds)), self.worlds.replay)
 
-    def explain(
-        self, seed: int, ego: int, metrics: dict[str, float], kind: str, seen: Trace
-    ) -> dict[str, Any]:
-        """Which vehicle and module could have avoided a failure.
+    def run(self, changed: Sequence[Changed]) -> Result:
+        """Worlds with changes, `[W, ...]`, without traces."""
+        return self._in_chunks(changed, self.worlds.run)
 
-        After a contact the world runs twice more, in which the ego, or the other vehicle, brakes as hard as
-        it can. Braking starts at the response time of RSS after the first unsafe moment, at most `UNSAFE` s
-        before the contact. A policy made of modules (`policies.base.variants`) drives again from that moment
-        on with a reference in the place of each module. A module is named if its reference avoids the failure
-        for at least `UNSAFE` s more.
+    def _in_chunks(self, changed: Sequence[Changed], run: Callable[[Started], Result]) -> Result:
+        parts, size = [], self.worlds.chunk
+        for first in range(0, len(changed), size):
+            some = changed[first : first + size]
+            worlds = self.worlds.start([one.seed for one in some])
+            told = worlds.carry.memory
+            slot, at = np.full(size, -1, np.int32), np.full(size, np.inf, np.float32)
+            slot[: len(some)], at[: len(some)] = [one.slot for one in some], [one.at for one in some]
+            told = told._replace(
+                slot=jax.device_put(slot, told.slot.sharding), at=jax.device_put(at, told.at.sharding)
+            )
+            result = run(worlds._replace(carry=worlds.carry._replace(memory=told)))
+            parts.append(jax.tree.map(lambda x: x[: len(some)], result))  # noqa: B023
+        return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+    def avoidable(self, failures: Sequence[tuple[int, int, dict[str, float]]]) -> list[dict[str, bool]]:
+        """Whether contacts could have been avoided by braking.
+
+        Each world runs twice more, in which the ego, or the other vehicle, brakes as hard as it can. Braking
+        starts at the response time of RSS after the first unsafe moment, at most `UNSAFE` s before the
+        contact.
+
+        Args:
+          failures: seed, number of the ego and metrics of each.
+
+        Returns:
+          `avoidable_by_ego` and `avoidable_by_other` of each.
+        """
+        changed = []
+        for seed, ego, metrics in failures:
+            event, unsafe = metrics["contact_time"], metrics["rss_first_time"]
+            start = max(event - UNSAFE, 0.0, 0.0 if np.isnan(unsafe) else min(unsafe, event))
+            for slot in (ego, int(metrics["contact_other"])):
+                changed.append(Changed(seed, slot, start + Rss().response))
+        if not changed:
+            return []
+        measures = on_host(self.run(changed).measures)
+        found = []
+        for k, (_, ego, metrics) in enumerate(failures):
+            found.append({})
+            for i, who in enumerate(("ego", "other")):
+                now = {name: x[2 * k + i] for name, x in of_ego(measures, ego).items()}
+                same = now["contact_other"] == metrics["contact_other"]
+                later = now["contact_time"] > metrics["contact_time"] + UNSAFE
+                found[-1][f"avoidable_by_{who}"] = bool(now["contacts"] == 0 or not same or later)
+        return found
+
+    def module(self, seed: int, ego: int, metrics: dict[str, float], kind: str, seen: Trace) -> str | None:
+        """The modules of the policy that are to blame for a failure, joined by "or".
+
+        A policy made of modules (`policies.base.variants`) drives again with a reference in the place of each
+        module, from the first unsafe moment on, or from `UNSAFE` s before the failure if that is later. A
+        module is named if its reference avoids the failure for at least `UNSAFE` s more.
 
         Args:
           seed: of the world.
@@ -89,63 +131,36 @@ class Reruns:
           metrics: of that world and ego.
           kind: of the failure.
           seen: trace of the world.
-
-        Returns:
-          `avoidable_by_ego`, `avoidable_by_other` (after a contact) and `module`.
         """
-        found: dict[str, Any] = {}
+        if not self._references:
+            return None
         event, unsafe = metrics[f"{kind}_time"], metrics["rss_first_time"]
         start = max(event - UNSAFE, 0.0)
-        if kind == "contact":
-            start = max(start, 0.0 if np.isnan(unsafe) else min(unsafe, event))
-            for who, slot in (("ego", ego), ("other", int(metrics["contact_other"]))):
-                changed = of_ego(on_host(self.run(seed, slot, start + Rss().response).measures), ego)
-                same = changed["contact_other"][0] == metrics["contact_other"]
-                later = changed["contact_time"][0] > event + UNSAFE
-                found[f"avoidable_by_{who}"] = bool(changed["contacts"][0] == 0 or not same or later)
-        blamed = self._modules(seed, ego, kind, start, event + UNSAFE, seen)
-        return found | {"module": " or ".join(blamed) or None}
-
-    def _modules(self, seed: int, ego: int, kind: str, start: float, end: float, seen: Trace) -> list[str]:
-        """Modules whose references from `start` s on avoid the failure."""
+        if kind == "contact" and not np.isnan(unsafe):
+            start = max(start, min(unsafe, event))
         every = self.rollout.config.decision_time
         first = int(start / every)
-        more = min(math.ceil(end / every), self.rollout.decisions) - first
-        world = self._start(self.lane_map, np.int32(seed))
-        found = []
+        more = min(math.ceil((event + UNSAFE) / every), self.rollout.decisions) - first
+        chunk, _ = self.worlds.advance(self.worlds.start([seed]), first)
+        world = jax.tree.map(lambda x: x[0], jax.device_get(chunk))
+        blamed = []
         for module, advance in self._references.items():
-            measures = advance(self.lane_map, world, np.int32(first), np.int32(more), seen.box)
+            measures = advance(self.worlds.lane_map, world, np.int32(more), seen.box)
             single = jax.tree.map(lambda x: x[None], jax.device_get(measures))
             if np.isnan(of_ego(on_host(single), ego)[f"{kind}_time"][0]):
-                found.append(module)
-        return found
+                blamed.append(module)
+        return " or ".join(blamed) or None
 
     def _with_reference(
-        self,
-        module: str,
-        lane_map: LaneMap,
-        world: Started,
-        first: jax.Array,
-        more: jax.Array,
-        box: jax.Array,
+        self, module: str, lane_map: LaneMap, world: Started, more: jax.Array, box: jax.Array
     ) -> Any:
-        """Metrics of a world with a reference in place of a module.
-
-        The reference drives from decision `first` on, for `more` decisions."""
-
-        def decisions(run: Rollout, count: jax.Array, carry: Carry) -> Carry:
-            def one(_: Any, carry: Carry) -> Carry:
-                return run.advance(lane_map, world.schedule, world.key, carry, 1)[1]
-
-            return jax.lax.fori_loop(0, count, one, carry)
-
+        """Metrics of a world after `more` decisions with a reference in place of a module."""
         run = self.rollout
         assert run.measure is not None
-        carry = decisions(run, first, world.carry)
-        other = variants(self.policy, Replayed(box, run.config.dt))[module]
-        carry = carry._replace(memory=other.init(run.config, lane_map, carry.state))
-        carry = decisions(replace(run, policy=other), more, carry)
-        return run.measure.result(run.config, lane_map, carry.measured)
+        other = variants(run.policy, Replayed(box, run.config.dt))[module]
+        carry = world.carry._replace(memory=other.init(run.config, lane_map, world.carry.state))
+        run = replace(run, policy=other)
+        return run.advance(lane_map, world.schedule, world.key, carry, more)[0].measures
 
 
 def of_ego(metrics: dict[str, Any], ego: int) -> dict[str, Any]:
@@ -153,17 +168,38 @@ def of_ego(metrics: dict[str, Any], ego: int) -> dict[str, Any]:
     return {name: x[:, ego] if np.ndim(x) == 2 else x for name, x in metrics.items()}
 
 
-class _Braking:
-    """A policy beside which one vehicle brakes hard."""
+class Told(NamedTuple):
+    """The memory of `CanBrake`: which vehicle brakes, and from when on."""
 
-    def __init__(self, policy: PolicyLike, slot: jax.Array, at: jax.Array) -> None:
-        self.free, self.others = policy.free, getattr(policy, "others", 0)
-        self.init = policy.init
-        self.policy, self.slot, self.at = policy, slot, at
+    slot: Int[Array, ""]  # -1: none
+    at: Float[Array, ""]  # s
+    policy: Any  # the memory of the policy
+
+
+@dataclass(frozen=True)
+class CanBrake:
+    """A policy beside which one vehicle brakes as hard as it can. Its memory says which."""
+
+    policy: PolicyLike
+
+    @property
+    def free(self) -> bool:
+        """That of the policy."""
+        return self.policy.free
+
+    @property
+    def others(self) -> int:
+        """Those of the policy."""
+        return getattr(self.policy, "others", 0)
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """No vehicle brakes."""
+        return Told(jnp.int32(-1), jnp.float32(jnp.inf), self.policy.init(config, lane_map, state))
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
     ) -> tuple[Command, Any]:
-        command, memory = self.policy(config, lane_map, state, memory, key)
-        brakes = (jnp.arange(state.lane.shape[0]) == self.slot) & (config.time(state.step) >= self.at)
-        return replace(command, brake=brakes), memory
+        """The command of the policy, and the braking."""
+        command, inner = self.policy(config, lane_map, state, memory.policy, key)
+        brakes = (jnp.arange(state.lane.shape[0]) == memory.slot) & (config.time(state.step) >= memory.at)
+        return replace(command, brake=brakes), memory._replace(policy=inner)

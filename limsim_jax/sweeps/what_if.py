@@ -1,39 +1,28 @@
-"""What if: a world of a sweep, stopped at some moments, from which `Rollout.advance` branches.
+"""What if: a world of a sweep is stopped at some moments, and futures go on from there.
 
-now = stopped(episodes, seed=7, times=[11.0, 12.0])
-futures = fork(now.carry, 5)  # [5, 2, ...]: five copies of both moments, to be changed at will
-advance = lambda carry: now.run.advance(now.lane_map, now.schedule, now.key, carry, decisions=20)[0]
-found = jax.jit(jax.vmap(jax.vmap(advance)))(futures).measures  # metrics [5, 2] of the next 20 decisions
+Worlds run up to the moment and on from it by the program of their sweep, so nothing new is compiled.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Key
+import numpy as np
+from jaxtyping import Int
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.simulation.rollout import Carry, Rollout, Started, started
+from limsim_jax.simulation.rollout import Result, Started
 from limsim_jax.sweeps.episode import Episodes
-from limsim_jax.types import Schedule
-from limsim_jax.xla import enable_compilation_cache, run_once
+from limsim_jax.traffic.ego import hand_over
+from limsim_jax.traffic.motion import boxes
+from limsim_jax.types import State
+from limsim_jax.xla import run_once
 
 
-class Stopped(NamedTuple):
-    """A world at some moments, ready to run on."""
-
-    run: Rollout
-    lane_map: LaneMap
-    schedule: Schedule
-    key: Key[Array, ""]  # of the policy
-    carry: Carry  # [moments, ...]; totals and metrics begin there
-
-
-def stopped(episodes: Episodes, seed: int, times: Sequence[float]) -> Stopped:
+def stopped(episodes: Episodes, seed: int, times: Sequence[float]) -> tuple[Started, list[int]]:
     """The world of a seed at some times of its episode.
 
     Args:
@@ -41,10 +30,13 @@ def stopped(episodes: Episodes, seed: int, times: Sequence[float]) -> Stopped:
       seed: of the world.
       times: s, rounded to whole decisions.
 
+    Returns:
+      The worlds `[M, ...]`, and the decisions at which they stand.
+
     Raises:
       ValueError: no times, or one before the start or after the horizon.
     """
-    run, lane_map = episodes.rollout, episodes.lane_map
+    run, worlds = episodes.rollout, episodes.worlds
     wanted = [round(float(time) / run.config.decision_time) for time in times]
     if not wanted:
         raise ValueError("no times to stop at; at least one is needed")
@@ -52,21 +44,51 @@ def stopped(episodes: Episodes, seed: int, times: Sequence[float]) -> Stopped:
         raise ValueError(
             f"times from {min(times):g} to {max(times):g} s; they must be within 0 and {run.horizon:g} s"
         )
-    enable_compilation_cache()
-    bare = replace(run, measure=None, record=None)
+    chunk, at, then = worlds.start([seed]), 0, {}
+    for decision in sorted(set(wanted)):
+        chunk, at = worlds.advance(chunk, decision - at)[0], decision
+        then[decision] = jax.tree.map(lambda x: x[0], chunk)
+    return jax.tree.map(lambda *x: jnp.stack(x), *(then[decision] for decision in wanted)), wanted
 
-    def start(lane_map: LaneMap, seed: int) -> Started:
-        return started(bare, lane_map, episodes.sample, seed)
 
-    schedule, key, begun = jax.jit(start, compiler_options=run_once())(lane_map, seed)
+def futures(
+    episodes: Episodes,
+    begun: Started,
+    decisions: int,
+    *,
+    same: bool,
+    change: Callable[[State, Any], State] | None = None,
+    copies: Int[np.ndarray, " W"] | None = None,
+) -> Result:
+    """Run worlds on, with every step; their metrics count from here on.
 
-    @jax.jit
-    def decide(lane_map: LaneMap, schedule: Schedule, carry: Carry) -> Carry:
-        return bare.advance(lane_map, schedule, key, carry, 1)[1]
+    Args:
+      episodes: whose policy drives from now on.
+      begun: worlds `[W, ...]`, as `stopped` gives them.
+      decisions: how long.
+      same: whether the policy is the one of before, which goes on with its memory.
+      change: `change(state, copy)` is the state from which a world goes on. It is traced.
+      copies: numbers for `change`.
 
-    carries = [begun]
-    for _ in range(max(wanted)):
-        carries.append(decide(lane_map, schedule, carries[-1]))
-    then = jax.tree.map(lambda *x: jnp.stack(x), *(carries[k] for k in wanted))
-    fresh = jax.jit(jax.vmap(run.restart, (None, 0, 0)))(lane_map, then.state, then.memory)
-    return Stopped(run, lane_map, schedule, key, fresh)
+    Returns:
+      Results `[W, ...]` on the host; traces are `[W, T, ...]`.
+    """
+    worlds, egos = episodes.worlds, episodes.egos
+    run = worlds.rollout
+
+    def begin(lane_map: LaneMap, world: Started, copy: Any) -> Started:
+        state, memory = world.carry.state, world.carry.memory
+        if not same:
+            box = boxes(lane_map, state)
+            policy = run.policy
+            state = hand_over(lane_map, state, box, egos, free=policy.free, others=policy.others)
+        if change is not None:
+            state = change(state, copy)
+        if not same:
+            memory = run.policy.init(run.config, lane_map, state)
+        return world._replace(carry=run.restart(lane_map, state, memory))
+
+    count = len(begun.carry.state.step)
+    number = np.zeros(count, np.int32) if copies is None else copies
+    ready = jax.jit(jax.vmap(begin, (None, 0, 0)), compiler_options=run_once())
+    return worlds.replay(ready(episodes.lane_map, begun, number), decisions)

@@ -428,6 +428,34 @@ def assign(lane_map: LaneMap, state: State, box: Float[Array, "N 5"], slot: Int[
     return replace(state, side=side)
 
 
+def hand_over(
+    lane_map: LaneMap, state: State, box: Float[Array, "N 5"], count: int, *, free: bool, others: int
+) -> State:
+    """Give the first `count` rows of `Egos` to another policy: all other vehicles return to the traffic.
+
+    Args:
+      lane_map: where.
+      state: the world now.
+      box: `motion.boxes`.
+      count: number of egos.
+      free: whether they move in the plane from now on.
+      others: rows for more vehicles that the new policy can drive.
+    """
+    egos = state.egos
+    slot, bound = egos.slot[:count], ~egos.free[:count]
+    # egos that stay in the plane keep their pose and steering there
+    stay = jnp.where(jnp.arange(egos.slot.shape[0]) < count, egos.slot if free else -1, -1)
+    state = assign(lane_map, state, box, stay)
+    kept = jax.tree.map(lambda x: x[:count], state.egos)
+    state = replace(
+        state, egos=with_rows(replace(kept, slot=jnp.where(bound | (not free), -1, slot)), others)
+    )
+    wanted = jnp.concatenate([slot, jnp.full(others, -1, slot.dtype)])
+    if free:
+        return assign(lane_map, state, box, wanted)
+    return sync(lane_map, replace(state, egos=replace(state.egos, slot=wanted)), box)
+
+
 def arrived(lane_map: LaneMap, state: State) -> Bool[Array, " E"]:
     """Egos whose front bumper has passed the end of their goal."""
     slot = state.egos.slot

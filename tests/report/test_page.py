@@ -184,7 +184,7 @@ def test_what_files_say_is_text(tmp_path):
     assert checker.tags.count("script") == 1
     assert "<script>alert" not in path.read_text()
     assert checker.text.count("No picture: ../<script>alert(1)</script>") == 2
-    assert (*group, 1) in asked
+    assert (*group, [1]) in asked
     assert [x.name for x in tmp_path.iterdir()] == ["report.html"]
     assert not content.file_name(group[0]).strip("abcdefghijklmnopqrstuvwxyz0123456789_")
 
@@ -255,12 +255,12 @@ def test_key_moments_are_pictured_and_replays_written(tmp_path):
 
     def replayer(*key):
         asked.append(key)
-        return network, lane_map, trace, 1, [], "more"
+        return [(network, lane_map, trace, 1, [], "more") for _ in key[2]]
 
     path = write_report(results, tmp_path / "report.html", replayer=replayer, say=said.append)
     checker = read(path)
-    assert asked == [(*GROUP, 1), (*GROUP, 0)]
-    assert said[0] == "replay 1 of 2: highway, like_traffic, seed 1"
+    assert asked == [(*GROUP, [1, 0])]
+    assert said == ["replays of highway, like_traffic: seeds 1, 0"]
     links = {link for link in checker.links if not link.startswith("#")}
     files = {"replays/highway-like_traffic-1.html", "replays/highway-like_traffic-0.html"}
     assert links == {f"{file}#t={t}" for file, t in zip(sorted(files), ("74.0", "0.0"), strict=True)}

@@ -1,18 +1,15 @@
 """A world that was stopped goes on as if it had not been; futures are changed at will."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.policies.simple import ConstantSpeed
-from limsim_jax.simulation.checkpoint import fork
-from limsim_jax.simulation.rollout import one_world
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import EgoTable, ExperimentFile, TrafficTable
-from limsim_jax.sweeps.what_if import stopped
+from limsim_jax.sweeps.what_if import futures, stopped
 
 pytestmark = pytest.mark.engine
 
@@ -35,9 +32,7 @@ def episodes():
     ego = EgoTable(start="1-", s=40.0, goal="3+")
     traffic = TrafficTable(vehicles=6)
     values = {"name": "small", "map": "roundabout", "horizon": 10.0, "slots": 8}
-    found = Episodes(ExperimentFile(**values, ego=(ego,), traffic=traffic), chunk=1, policy=Counting())
-    found.rollout = replace(found.rollout, measure=None)  # metrics take long to compile
-    return found
+    return Episodes(ExperimentFile(**values, ego=(ego,), traffic=traffic), chunk=3, policy=Counting())
 
 
 @pytest.fixture(scope="module")
@@ -45,33 +40,51 @@ def now(episodes):
     return stopped(episodes, SEED, [0.0, 4.0, 2.6])
 
 
+def rows(worlds, which):
+    return jax.tree.map(lambda x: x[jnp.asarray(which)], worlds)
+
+
 def test_a_stopped_world_goes_on_as_in_the_sweep(episodes, now):
-    run, left = now.run, now.run.decisions - 8
-
-    def whole(lane_map):
-        return one_world(run, lane_map, episodes.sample, SEED)
-
-    def rest(lane_map, schedule, carry):
-        return run.advance(lane_map, schedule, now.key, carry, left)[0]
-
-    wanted = jax.jit(whole)(now.lane_map).state
-    futures = fork(jax.tree.map(lambda x: x[1], now.carry), 2)
-    speed, count = futures.memory
-    changed = futures._replace(memory=(speed * jnp.asarray([1.0, 0.2])[:, None], count))
-    found = jax.jit(jax.vmap(rest, (None, None, 0)))(now.lane_map, now.schedule, changed).state
-    for x, y in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
-        np.testing.assert_allclose(np.asarray(x, float), np.asarray(y[0], float), rtol=1e-4, atol=1e-3)
-    ego = int(wanted.egos.slot[0])
-    assert found.v[1, ego] < 0.5 * found.v[0, ego]  # the future in which it slowed down
+    both = rows(now[0], [1, 1])
+    speed, count = both.carry.memory.policy
+    memory = both.carry.memory._replace(policy=(speed.at[1].mul(0.2), count))
+    both = both._replace(carry=both.carry._replace(memory=memory))
+    found = futures(episodes, both, 12, same=True)
+    whole = episodes.replay(SEED)
+    np.testing.assert_array_equal(found.trace.box[0], whole.trace.box[40:])  # to the last bit
+    np.testing.assert_array_equal(found.trace.time[0], whole.trace.time[40:])
+    ego = whole.ego
+    assert found.trace.v[1, -1, ego] < 0.5 * found.trace.v[0, -1, ego]  # the future in which it slowed down
 
 
 def test_times_are_rounded_to_decisions(now):
-    np.testing.assert_array_equal(now.carry.state.step, [0, 40, 25])  # 2.6 s is no decision, 2.5 s is
+    worlds, decisions = now
+    assert decisions == [0, 8, 5]  # 2.6 s is no decision, 2.5 s is
+    np.testing.assert_array_equal(worlds.carry.state.step, [0, 40, 25])
 
 
-def test_policies_remember_and_totals_begin_anew(now):
-    np.testing.assert_array_equal(now.carry.memory[1], [0, 8, 5])
-    np.testing.assert_array_equal(now.carry.totals.distance, np.zeros(3))
+def test_policies_remember_and_totals_begin_anew(episodes, now):
+    worlds, _ = now
+    np.testing.assert_array_equal(worlds.carry.memory.policy[1], [0, 8, 5])
+    found = futures(episodes, worlds, 2, same=True)
+    assert 0 < found.totals.time.max() <= 8.01  # s, of 8 vehicles in 1 s
+
+
+def test_another_policy_takes_the_wheel_and_gives_it_back(episodes, now):
+    worlds = rows(now[0], [1])
+    meek = futures(episodes.under(LikeTraffic()), worlds, 8, same=False)
+    traffic = Episodes(episodes.experiment, chunk=1, policy=LikeTraffic())
+    before, _ = stopped(traffic, SEED, [4.0])
+    assert not bool(before.carry.state.egos.free[0, 0])
+    fast = futures(traffic.under(ConstantSpeed(speed=15.0)), before, 8, same=False)
+    assert meek.trace.plan is None and not bool(meek.state.egos.free[0, 0])
+    ego = fast.state.egos.slot[0, 0]
+    assert bool(fast.state.egos.free[0, 0]) and abs(fast.trace.v[0, -1, ego] - 15.0) < 0.1
+    for found, start in ((meek, worlds), (fast, before)):  # nothing jumps
+        first = np.asarray(found.trace.box[0, 0, ego, :2])
+        there = np.asarray([start.carry.state.egos.x[0, 0], start.carry.state.egos.y[0, 0]])
+        np.testing.assert_allclose(first, there, atol=1.6)  # m, within 0.1 s at 15 m/s
+        assert np.abs(np.diff(found.trace.box[0, :, ego, :2], axis=0)).max() < 1.6
 
 
 def test_places_of_planned_vehicles_stay_as_many():
@@ -79,14 +92,11 @@ def test_places_of_planned_vehicles_stay_as_many():
     ego = EgoTable(start="1-", s=40.0, goal="3+", policy="area_of_interest", options=options)
     values = {"name": "small", "map": "roundabout", "horizon": 10.0, "slots": 8}
     episodes = Episodes(ExperimentFile(**values, ego=(ego,), traffic=TrafficTable(vehicles=6)), chunk=1)
-    episodes.rollout = replace(episodes.rollout, measure=None)
-    run, lane_map, schedule, key, carry = stopped(episodes, SEED, [1.0])
-    assert carry.state.egos.slot.shape == (1, 4)
-    shapes = jax.eval_shape(
-        lambda lane_map: run.advance(lane_map, schedule, key, jax.tree.map(lambda x: x[0], carry), 1),
-        lane_map,
-    )
-    assert shapes[1].state.egos.slot.shape == (4,)
+    worlds, _ = stopped(episodes, SEED, [1.0])
+    assert worlds.carry.state.egos.slot.shape == (1, 4)
+    assert futures(episodes, worlds, 1, same=True).state.egos.slot.shape == (1, 4)
+    alone = futures(episodes.under(LikeTraffic()), worlds, 1, same=False).state.egos
+    assert alone.slot.shape == (1, 1) and alone.slot[0, 0] == worlds.carry.state.egos.slot[0, 0]
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ from limsim_jax.report.templates import read, render
 if TYPE_CHECKING:
     from limsim_jax.sweeps.store import Results
 
-Replayer = Callable[[str, str, int], tuple[Any, ...]]
+Replayer = Callable[[str, str, Sequence[int]], Sequence[tuple[Any, ...]]]
 """(scenario, policy, seed) -> (network, lane_map, trace, slot of the ego, moments, ...)."""
 
 Found = Mapping[tuple[str, str, str], dict[str, Any]]
@@ -79,11 +79,11 @@ def write_report(
     Args:
       results: of a sweep.
       path: the .html file to write; its folder is made.
-      replayer: regenerates an episode: (scenario, policy, seed) -> (network, lane_map, trace, slot of the
-        ego, moments). Without one there are neither pictures nor replays, only the commands for them.
+      replayer: regenerates episodes: (scenario, policy, seeds) -> a (network, lane_map, trace, slot of the
+        ego, moments) of each. Without one there are neither pictures nor replays, only commands for them.
       worst: how many of the worst episodes to show with pictures.
-      seconds: s, after which no further replay begins; the first one always does.
-      say: called with a line before each replay.
+      seconds: s, after which no further scenario or policy is replayed; the first one always is.
+      say: called with a line before the replays of each.
       level: of the intervals.
       table: the summary at that level, if there is one already.
 
@@ -151,29 +151,38 @@ def _cards(
 ) -> tuple[list[dict[str, Any]], dict[Key, str]]:
     """Cards of the worst episodes, and the addresses of their replays."""
     cards, replays, start = [], {}, time.monotonic()
-    for place, row in enumerate(shown, 1):
+    again: dict[Group, dict[int, tuple[Any, ...]] | str] = {}  # replays by seed, or what went wrong
+    for row in shown:
+        group = row["scenario"], row["policy"]
         views, fault = [], ""
-        if replayer is not None and (place == 1 or time.monotonic() - start < seconds):
-            if say is not None:
-                say(f"replay {place} of {len(shown)}: {row['scenario']}, {row['policy']}, seed {row['seed']}")
-            try:
-                views, address, found = _replayed(row, names, path, replayer)
-                replays[key_of(row)] = address
-                row = {**row, **found}
-            except ValueError as error:  # one episode that cannot be shown is no reason to lose the page
-                fault = str(error)
+        in_time = not again or time.monotonic() - start < seconds
+        if replayer is not None and (group in again or in_time):
+            if group not in again:
+                seeds = [int(one["seed"]) for one in shown if (one["scenario"], one["policy"]) == group]
+                if say is not None:
+                    say(f"replays of {group[0]}, {group[1]}: seeds {', '.join(map(str, seeds))}")
+                try:
+                    again[group] = dict(zip(seeds, replayer(*group, seeds), strict=True))
+                except ValueError as error:  # what cannot be shown is no reason to lose the page
+                    again[group] = str(error)
+            found = again[group]
+            if isinstance(found, str):
+                fault = found
+            else:
+                views, replays[key_of(row)], said = _shown(row, names, path, found[int(row["seed"])])
+                row = {**row, **said}
         cards.append(card(row, names, views=views, fault=fault, replay=replays.get(key_of(row))))
     return cards, replays
 
 
-def _replayed(
-    row: Mapping[str, Any], names: Names, path: Path, replayer: Replayer
+def _shown(
+    row: Mapping[str, Any], names: Names, path: Path, replay: tuple[Any, ...]
 ) -> tuple[list[dict[str, str]], str, dict[str, Any]]:
     """Pictures of a key moment, the address of the replay, avoidability."""
     from limsim_jax.report.pictures import pictures
     from limsim_jax.report.viewer import write_viewer
 
-    network, lane_map, trace, ego, moments, *_ = replayer(row["scenario"], row["policy"], row["seed"])
+    network, lane_map, trace, ego, moments, *_ = replay
     name = f"{file_name(row['scenario'])}-{file_name(row['policy'])}-{int(row['seed'])}.html"
     folder = path.parent / "replays"
     folder.mkdir(parents=True, exist_ok=True)
