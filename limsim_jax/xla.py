@@ -8,20 +8,29 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import os
+import pickle
+import platform
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 from jax import lax
 from jax.custom_batching import custom_vmap
+from jax.experimental import serialize_executable
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int
 
-from limsim_jax.files import cache_directory
+from limsim_jax.files import cache_directory, write_whole
 
 Tree = TypeVar("Tree")
+
+PROGRAMS = 64
+"""Compiled programs that are kept on disk, of 5 to 20 MB each."""
 
 _kept_apart = jax.jit(lax.optimization_barrier)
 
@@ -126,3 +135,55 @@ def enable_compilation_cache() -> None:
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "xla"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+
+
+def load_program(name: str | None) -> Any:
+    """A compiled program that `keep_program` has kept; None if there is none.
+
+    Why: JAX's own cache keeps machine code only, so a program is traced and lowered in every process before
+    it is found. Gain: see `experiments/results/start_speed.md`.
+
+    Args:
+      name: all that the program depends on, beside the versions and settings of JAX and the machine, which
+        are added. None: nothing is kept by it.
+    """
+    if name is None:
+        return None
+    path = _program_path(name)
+    try:
+        found = serialize_executable.deserialize_and_load(*pickle.loads(path.read_bytes()))
+        os.utime(path)
+        return found
+    except Exception:  # not there, damaged, or of another machine
+        return None
+
+
+def keep_program(name: str | None, program: Any) -> Any:
+    """Keep a compiled program on disk, and return it."""
+    if name is None:
+        return program
+    path = _program_path(name)
+    with contextlib.suppress(Exception):  # a program that cannot be kept, or a full disk
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, pickle.dumps(serialize_executable.serialize(program)))
+        _forget(path.parent)
+    return program
+
+
+def _program_path(name: str) -> Path:
+    config, device = jax.config.values, jax.local_devices()[0]
+    settings = [
+        jax.__version__, jaxlib.__version__, device.platform, device.device_kind, jax.local_device_count(),
+        platform.machine(), platform.processor(), os.environ.get("XLA_FLAGS"),
+        config["jax_enable_x64"], config["jax_default_prng_impl"], config["jax_threefry_partitionable"],
+        config["jax_default_matmul_precision"],
+    ]  # fmt: skip
+    key = hashlib.sha256(repr((name, settings)).encode()).hexdigest()[:32]
+    return cache_directory() / "programs" / f"{key}.bin"
+
+
+def _forget(folder: Path) -> None:
+    """Remove the programs that were not used for the longest time."""
+    paths = sorted(folder.glob("*.bin"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in paths[PROGRAMS:]:
+        path.unlink(missing_ok=True)

@@ -13,11 +13,13 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from limsim_jax.maps.conflicts import ConflictType, build_conflicts
 from limsim_jax.maps.network import (
@@ -157,6 +159,12 @@ def lane_states(table: SignalTable, phase: Int[Array, " G"]) -> Int[Array, " L"]
     """The `SignalState` at the entry of every lane in these phases."""
     program = jnp.asarray(table.lane_program)
     return jnp.asarray(table.state)[program, jnp.asarray(phase)[program], table.lane_link]
+
+
+def lane_states_on_host(table: SignalTable, phase: Any) -> NDArray[np.int32]:
+    """`lane_states` of many moments, `[T, G]` to `[T, L]`, in NumPy."""
+    program, link = np.asarray(table.lane_program), np.asarray(table.lane_link)
+    return np.asarray(table.state)[program, np.asarray(phase)[:, program], link]
 
 
 def movement_states(table: SignalTable, phase: Int[Array, " G"]) -> Int[Array, " M"]:

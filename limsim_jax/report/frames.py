@@ -17,7 +17,7 @@ from limsim_jax.maps.lane_map import LaneMap, absolute
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.outline import Bounds, signal_bars
 from limsim_jax.maps.signal_table import SignalState
-from limsim_jax.maps.signals import lane_states
+from limsim_jax.maps.signals import lane_states_on_host
 from limsim_jax.report.draw import TRAFFIC_ZORDER, draw_network
 from limsim_jax.report.draw.painter import INK
 from limsim_jax.report.ending import ending, without_arrived
@@ -136,8 +136,7 @@ class Scene:
         limits = [lane.speed_limit for lane in network.drivable_lanes()]
         self.top_speed = 5.0 * math.ceil(max(limits, default=10.0) / 5.0)  # m/s
         self.bars, rows = signal_bars(network, lane_map)  # [B, 2, 2]
-        states = jax.vmap(lane_states, (None, 0))(lane_map.signals, trace.phase)
-        self.signals = np.asarray(states)[:, rows]  # [T, B]
+        self.signals = lane_states_on_host(lane_map.signals, trace.phase)[:, rows]  # [T, B]
 
     def outlines(self, k: int, scale: float) -> tuple[NDArray[Any], NDArray[Any]]:
         """Slots on the road, and their polygons `[M, 6, 2]` times `scale`."""

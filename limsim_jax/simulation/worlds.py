@@ -20,7 +20,7 @@ from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.simulation.rollout import Result, Rollout, Started, started
 from limsim_jax.simulation.totals import Totals
 from limsim_jax.types import Scenario
-from limsim_jax.xla import enable_compilation_cache, run_once
+from limsim_jax.xla import enable_compilation_cache, keep_program, load_program, run_once
 
 
 def over_worlds(
@@ -52,6 +52,8 @@ class Worlds:
       sampler: scenario of a world from its key; of the same shapes for all keys.
       chunk: worlds per call; rounded up to a multiple of the number of devices.
       devices: all local devices by default.
+      names: all that the sampler and the run depend on beside shapes. Programs are kept on disk by these
+        names; where one is None, they are not.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Worlds:
         *,
         chunk: int = 64,
         devices: Sequence[Any] | None = None,
+        names: tuple[str | None, str | None] = (None, None),
     ) -> None:
         devices = list(jax.local_devices() if devices is None else devices)
         if chunk < 1:
@@ -79,18 +82,34 @@ class Worlds:
             result, carry = run.advance(lane_map, *world, decisions)
             return world._replace(carry=carry), result
 
-        self._start: Any = over_worlds(start, self.mesh, run_once())
-        self._advance: Any = over_worlds(advance, self.mesh)
+        sampling, running = names
+        self._advance_name = None if running is None else f"{running} {self.chunk} {_shapes(lane_map)}"
+        self._start_name = None if sampling is None or running is None else f"{self._advance_name} {sampling}"
+        self._start_jit: Any = over_worlds(start, self.mesh, run_once())
+        self._advance_jit: Any = over_worlds(advance, self.mesh)
+        self._start = self._advance = None
 
     def compile(self) -> Worlds:
-        """Compile now; otherwise the first chunk does."""
+        """Get the programs ready; otherwise the first chunk does."""
+        if self._advance is not None:
+            return self
         enable_compilation_cache()
         seeds = jnp.zeros(self.chunk, jnp.int32)
+
         with ThreadPoolExecutor(1) as pool, no_garbage_collection():
-            start = self._start.lower(self.lane_map, seeds)
-            compiled = pool.submit(start.compile)  # while the other is traced and compiled
-            self._advance = self._advance.lower((self.lane_map, np.int32(0)), start.out_info).compile()
-            self._start = compiled.result()
+            start = load_program(self._start_name)
+            if start is None:
+                lowered = self._start_jit.lower(self.lane_map, seeds)
+                kept = pool.submit(lambda: keep_program(self._start_name, lowered.compile()))
+                worlds = lowered.out_info  # it compiles while the other program is traced
+            else:
+                kept, worlds = None, start.out_info
+            name = None if self._advance_name is None else f"{self._advance_name} {_shapes(worlds)}"
+            advance = load_program(name)
+            if advance is None:
+                shared = self.lane_map, np.int32(0)
+                advance = keep_program(name, self._advance_jit.lower(shared, worlds).compile())
+            self._start, self._advance = start if kept is None else kept.result(), advance
         return self
 
     def start(self, seeds: Sequence[int]) -> Started:
@@ -102,7 +121,7 @@ class Worlds:
         _check(seeds)
         if len(seeds) > self.chunk:
             raise ValueError(f"{len(seeds)} seeds at once; at most {self.chunk}")
-        enable_compilation_cache()
+        self.compile()
         padded = np.array([*seeds, *[seeds[-1]] * (self.chunk - len(seeds))], np.int32)
         return self._start(self.lane_map, padded)
 
@@ -110,6 +129,7 @@ class Worlds:
         """A chunk some decisions later, on the devices.
 
         Records of the result are those of the last decision."""
+        self.compile()
         return self._advance((self.lane_map, np.int32(decisions)), worlds)
 
     def run(self, worlds: Started) -> Result:
@@ -146,10 +166,8 @@ class Worlds:
         for first in range(0, count, self.chunk):
             some = min(self.chunk, count - first)
             which = np.minimum(np.arange(first, first + self.chunk), count - 1)
-            chunk = worlds
-            if some < count or some < self.chunk:
-                chunk = jax.device_put(jax.tree.map(lambda x: x[which], worlds), there)  # noqa: B023
-            result = run(chunk, some)
+            chunk = worlds if count == self.chunk else jax.tree.map(lambda x: x[which], worlds)  # noqa: B023
+            result = run(jax.device_put(chunk, there), some)
             parts.append(jax.tree.map(lambda x: x[:some], result))  # noqa: B023
         return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
@@ -165,6 +183,12 @@ class Worlds:
         """Totals of all worlds `[len(seeds)]`, on the host."""
         parts = [result.totals for _, result in self.chunks(seeds)]
         return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def _shapes(tree: Any) -> str:
+    """Shapes and types of the arrays of a tree, and what is static in it."""
+    leaves, structure = jax.tree.flatten(tree)
+    return f"{structure} {[(x.shape, str(x.dtype)) for x in leaves]}"
 
 
 def _check(seeds: Sequence[int]) -> None:

@@ -9,9 +9,10 @@ import dataclasses
 import hashlib
 import importlib
 import inspect
+import json
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -307,6 +308,23 @@ def describe(value: Any) -> Any:
     elif not isinstance(value, type | FunctionType):
         found |= {name: describe(x) for name, x in sorted(getattr(value, "__dict__", {}).items())}
     return found
+
+
+def describe_program(*parts: Any) -> str | None:
+    """All that a compiled program depends on; None if code that is not ours takes part.
+
+    The source of the package and shapes of arguments are not included.
+    """
+    found = describe(parts)
+
+    def kinds(tree: Any) -> Iterator[str]:
+        if isinstance(tree, Mapping):
+            yield tree.get("is", "limsim_jax.")
+        for x in tree.values() if isinstance(tree, Mapping) else tree if isinstance(tree, list) else ():
+            yield from kinds(x)
+
+    foreign = any(not kind.startswith("limsim_jax.") or kind.endswith(".HostPolicy") for kind in kinds(found))
+    return None if foreign else json.dumps(found, sort_keys=True)
 
 
 def _own_source(kind: Any) -> str | None:

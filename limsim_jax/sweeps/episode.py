@@ -35,6 +35,7 @@ from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweeps.build import (
     demand_of,
     describe,
+    describe_program,
     egos_of,
     flows_of,
     map_of,
@@ -108,7 +109,12 @@ class Episodes:
         self.world_bytes = self._memory()
         self.chunk = self._chunk() if chunk is None else chunk
         run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
-        self.worlds = Worlds(run, self.lane_map, self.sample, chunk=self.chunk)
+        source, slots = _source_hash(), experiment.slots
+        names = (
+            describe_program(source, self._demand, self._egos, slots),
+            describe_program(source, replace(run, horizon=1.0)),  # programs run for any time
+        )
+        self.worlds = Worlds(run, self.lane_map, self.sample, chunk=self.chunk, names=names)
         self.chunk = self.worlds.chunk
 
     @property

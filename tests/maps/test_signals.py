@@ -32,6 +32,7 @@ from limsim_jax.maps.signals import (
     build_signals,
     generate_programs,
     lane_states,
+    lane_states_on_host,
     movement_states,
     phase_at,
     yellow_time,
@@ -98,6 +99,9 @@ def test_lookup_under_jit_and_vmap_and_padding():
         assert phases[n, 0] == phase_at(table, t)[0]
     assert (phases[:, 1:] == 0).all()
     one = np.asarray(lane_states(table, phase_at(table, 3.0)))
+    phases = np.stack([phase_at(table, t) for t in (3.0, 30.0)])
+    np.testing.assert_array_equal(lane_states_on_host(table, phases)[0], one)
+    np.testing.assert_array_equal(lane_states_on_host(table, phases)[1], lane_states(table, phases[1]))
     many = np.asarray(lane_states(device, phase_at(device, 3.0)))
     np.testing.assert_array_equal(many[: len(one) - 1], one[:-1])
     assert (many[len(one) - 1 :] == SignalState.OFF).all()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +23,7 @@ from limsim_jax.maps.outline import (
     surface_rank,
     view,
 )
-from limsim_jax.maps.signals import lane_states
+from limsim_jax.maps.signals import lane_states_on_host
 from limsim_jax.report.viewer.pack import Pack, origin
 
 _THIN = 0.03  # m, a drawn border may deviate from its lane's by this
@@ -59,7 +58,7 @@ def add_map(pack: Pack, network: Network, lane_map: LaneMap, phase: NDArray[Any]
     pack.add_points("line", np.concatenate([*(bar for _, bar in lines), np.zeros((0, 2))]), shift)
     bars, rows = signal_bars(network, lane_map)
     pack.add_points("light", bars.reshape(-1, 2), shift)
-    states = np.asarray(jax.vmap(lane_states, (None, 0))(lane_map.signals, phase))[:, rows]
+    states = lane_states_on_host(lane_map.signals, phase)[:, rows]
     pack.add("light_state", states.T, 1)
     drivable = list(network.drivable_lanes())
     return {
