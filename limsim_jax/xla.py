@@ -141,7 +141,7 @@ def load_program(name: str | None) -> Any:
     """A compiled program that `keep_program` has kept; None if there is none.
 
     Why: JAX's own cache keeps machine code only, so a program is traced and lowered in every process before
-    it is found. Gain: see `experiments/results/start_speed.md`.
+    it is found. Gain: a warm `sweep intersection` starts its first world after 1.2 s, not 12.
 
     Args:
       name: all that the program depends on, beside the versions and settings of JAX and the machine, which

@@ -1,10 +1,13 @@
 """Every compiler trick does what it is for, in the compiled program or in the numbers."""
 
+import os
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from limsim_jax import xla
 from limsim_jax.xla import (
     batch_last,
     column_min,
@@ -106,3 +109,28 @@ def test_a_compilation_cache_that_the_user_chose_stays(tmp_path):
 def test_an_interval_is_within_its_count(count):
     number, _ = interval(jnp.asarray([-1e6, 1e6], jnp.float32), count)
     np.testing.assert_array_equal(number, [0, count - 1])
+
+
+def test_kept_programs_are_loaded_without_a_trace(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIMSIM_JAX_CACHE", str(tmp_path))
+    program = jax.jit(lambda x: {"twice": 2 * x}).lower(jnp.zeros(3)).compile()
+    assert xla.load_program("twice") is None
+    assert xla.keep_program("twice", program) is program
+    found = xla.load_program("twice")
+    np.testing.assert_array_equal(found(jnp.arange(3.0))["twice"], [0, 2, 4])
+    assert xla.load_program("thrice") is None and xla.load_program(None) is None
+    (path,) = (tmp_path / "programs").iterdir()
+    path.write_bytes(path.read_bytes()[:100])  # damaged: it is as if it were not there
+    assert xla.load_program("twice") is None
+
+
+def test_programs_that_were_not_used_for_long_are_forgotten(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIMSIM_JAX_CACHE", str(tmp_path))
+    monkeypatch.setattr(xla, "PROGRAMS", 2)
+    program = jax.jit(lambda x: x + 1).lower(1.0).compile()
+    for k, name in enumerate(("a", "b", "a", "c")):
+        if xla.load_program(name) is None:
+            xla.keep_program(name, program)
+        for path in (tmp_path / "programs").iterdir():  # time passes
+            os.utime(path, (path.stat().st_atime, path.stat().st_mtime - 10))
+    assert [xla.load_program(name) is not None for name in "abc"] == [True, False, True]

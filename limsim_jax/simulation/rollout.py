@@ -29,6 +29,9 @@ from limsim_jax.traffic.engine import Tick, Traffic, drive
 from limsim_jax.types import Config, Scenario, Schedule, State
 from limsim_jax.xla import mapped_like
 
+KEPT = 10
+"""Decisions whose records a run of any length keeps: the last ones; of fewer, from the first on."""
+
 
 class Result(NamedTuple):
     """The end of a run."""
@@ -131,8 +134,8 @@ class Rollout:
     ) -> tuple[Result, Carry]:
         """Run on to the horizon or for a number of decisions.
 
-        One program serves all numbers if the number is an array. It keeps the records of the last decision
-        only, `[decision_every, ...]`, and has no gradient in reverse.
+        One program serves all numbers if the number is an array. It keeps the records of `KEPT` decisions,
+        and has no gradient in reverse.
 
         Returns the result, and the carry to run on from there."""
         config, measure = self.config, self.measure
@@ -161,12 +164,17 @@ class Rollout:
         length = self.decisions if decisions is None else decisions
         if isinstance(length, int):
             carry, records = lax.scan(decide, carry, None, length=length)
-            records = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
         else:
             once = jax.jit(decide)  # traced once for both uses
             shapes = jax.eval_shape(once, carry, None)[1]
-            none = mapped_like(carry.state.s, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
-            carry, records = lax.fori_loop(0, length, lambda _, both: once(both[0], None), (carry, none))
+            none = jax.tree.map(lambda x: jnp.zeros((KEPT, *x.shape), x.dtype), shapes)
+
+            def keep(i: Array, both: tuple[Carry, Any]) -> tuple[Carry, Any]:
+                carry, kept = once(both[0], None)
+                return carry, jax.tree.map(lambda x, new: x.at[i % KEPT].set(new), both[1], kept)
+
+            carry, records = lax.fori_loop(0, length, keep, (carry, mapped_like(carry.state.s, none)))
+        records = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
         late = delayed(schedule, carry.state, config.time(carry.state.step))
         carry = carry._replace(totals=replace(carry.totals, waiting=jnp.sum(late, dtype=jnp.int32)))
         found = None if measure is None else measure.result(config, lane_map, carry.measured)

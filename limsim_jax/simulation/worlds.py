@@ -17,18 +17,24 @@ from jaxtyping import Array, Int, Key
 
 from limsim_jax.files import no_garbage_collection
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.simulation.rollout import Result, Rollout, Started, started
+from limsim_jax.simulation.rollout import KEPT, Result, Rollout, Started, started
 from limsim_jax.simulation.totals import Totals
 from limsim_jax.types import Scenario
 from limsim_jax.xla import enable_compilation_cache, keep_program, load_program, run_once
 
 
 def over_worlds(
-    one: Callable[[Any, Any], Any], mesh: Mesh, compiler_options: dict[str, Any] | None = None
+    one: Callable[[Any, Any], Any],
+    mesh: Mesh,
+    compiler_options: dict[str, Any] | None = None,
+    *,
+    consumes: bool = False,
 ) -> Any:
     """A function of what all worlds share and of one world, jitted for `[B, ...]` worlds.
 
-    The batch is divided among the devices of the mesh."""
+    The batch is divided among the devices of the mesh. `consumes`: the arrays of the worlds are used for
+    those of the result, and are gone.
+    """
     everywhere, worlds = PartitionSpec(), PartitionSpec("worlds")
     many = jax.shard_map(
         jax.vmap(one, in_axes=(None, 0)),
@@ -38,7 +44,10 @@ def over_worlds(
         check_vma=False,
     )
     here, there = (NamedSharding(mesh, spec) for spec in (everywhere, worlds))
-    return jax.jit(many, in_shardings=(here, there), out_shardings=there, compiler_options=compiler_options)
+    return jax.jit(
+        many, in_shardings=(here, there), out_shardings=there, compiler_options=compiler_options,
+        donate_argnums=(1,) if consumes else (),
+    )  # fmt: skip
 
 
 class Worlds:
@@ -86,7 +95,7 @@ class Worlds:
         self._advance_name = None if running is None else f"{running} {self.chunk} {_shapes(lane_map)}"
         self._start_name = None if sampling is None or running is None else f"{self._advance_name} {sampling}"
         self._start_jit: Any = over_worlds(start, self.mesh, run_once())
-        self._advance_jit: Any = over_worlds(advance, self.mesh)
+        self._advance_jit: Any = over_worlds(advance, self.mesh, consumes=True)
         self._start = self._advance = None
 
     def compile(self) -> Worlds:
@@ -126,9 +135,10 @@ class Worlds:
         return self._start(self.lane_map, padded)
 
     def advance(self, worlds: Started, decisions: int) -> tuple[Started, Result]:
-        """A chunk some decisions later, on the devices.
+        """A chunk some decisions later, on the devices; `worlds` themselves are used up.
 
-        Records of the result are those of the last decision."""
+        Records of the result are those of at most `KEPT` decisions.
+        """
         self.compile()
         return self._advance((self.lane_map, np.int32(decisions)), worlds)
 
@@ -148,10 +158,14 @@ class Worlds:
         """
 
         def run(chunk: Started, count: int) -> Result:
-            result, records = None, []
-            for _ in range(self.rollout.decisions if decisions is None else decisions):
-                chunk, result = self.advance(chunk, 1)
-                records.append(jax.tree.map(lambda x: x[:count], jax.device_get(result.trace)))
+            result, records, left = None, [], self.rollout.decisions if decisions is None else decisions
+            while left:
+                some = min(left, KEPT)
+                chunk, result = self.advance(chunk, some)
+                trace = jax.device_get(result.trace)
+                steps = some * self.rollout.config.decision_every
+                records.append(jax.tree.map(lambda x: x[:count, :steps], trace))  # noqa: B023
+                left -= some
             assert result is not None
             whole = jax.device_get(result._replace(trace=None))
             return whole._replace(trace=jax.tree.map(lambda *x: np.concatenate(x, 1), *records))
