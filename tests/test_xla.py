@@ -128,7 +128,7 @@ def test_programs_that_were_not_used_for_long_are_forgotten(tmp_path, monkeypatc
     monkeypatch.setenv("LIMSIM_JAX_CACHE", str(tmp_path))
     monkeypatch.setattr(xla, "PROGRAMS", 2)
     program = jax.jit(lambda x: x + 1).lower(1.0).compile()
-    for k, name in enumerate(("a", "b", "a", "c")):
+    for name in ("a", "b", "a", "c"):
         if xla.load_program(name) is None:
             xla.keep_program(name, program)
         for path in (tmp_path / "programs").iterdir():  # time passes
