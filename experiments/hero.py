@@ -26,7 +26,7 @@ COLOURS = {"": (90, 96, 105), "arrived": (26, 127, 55), "contact": (207, 34, 46)
 
 
 def pane(world: lj.World) -> list[Image.Image]:
-    """The frames of a world, each with a line of text above the picture."""
+    """The frames of a world, with a line of text above each."""
     contact = next((x["time"] for x in world.moments if x["kind"] == "contact"), np.inf)
     blame = next((x["responsible"] for x in world.moments if x["kind"] == "contact"), "")
     inside = np.flatnonzero(world.trace.active[:, world.ego])
@@ -36,7 +36,9 @@ def pane(world: lj.World) -> list[Image.Image]:
             Path(folder) / "w.gif", bounds=BOUNDS, begin=BEGIN, end=END, every=round(STEP / 0.1), moments=()
         )
         with Image.open(path) as film:
-            part = [round(share * film.size[i % 2]) for i, share in enumerate(MAP_ONLY)]
+            left, top, right, bottom = MAP_ONLY
+            across, down = film.size
+            part = left * across, top * down, right * across, bottom * down
             pictures = [frame.convert("RGB").crop(part) for frame in ImageSequence.Iterator(film)]
     font = ImageFont.load_default(12)
     frames = []

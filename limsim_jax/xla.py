@@ -12,7 +12,7 @@ import hashlib
 import os
 import pickle
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,6 +22,7 @@ import jaxlib
 from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.experimental import serialize_executable
+from jax.experimental.compilation_cache import compilation_cache
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int
 
@@ -131,10 +132,27 @@ def use_all_cores(cores: int | None = None) -> int:
 
 
 def enable_compilation_cache() -> None:
-    """Keep compiled programs on disk, unless JAX has a folder already."""
+    """Keep compiled programs on disk, in JAX's folder if it has one."""
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "xla"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+
+
+@contextlib.contextmanager
+def without_compilation_cache() -> Iterator[None]:
+    """JAX's own cache is neither read nor written within, in any thread.
+
+    Why: a program for CPUs that JAX has read from its cache cannot be kept: once written and read again, it
+    lacks some of its functions, and fails where it runs.
+    """
+    before = jax.config.values["jax_enable_compilation_cache"]
+    jax.config.update("jax_enable_compilation_cache", False)
+    compilation_cache.reset_cache()  # or JAX goes by what it has seen in the first place
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_compilation_cache", before)
+        compilation_cache.reset_cache()
 
 
 def load_program(name: str | None) -> Any:
@@ -159,7 +177,7 @@ def load_program(name: str | None) -> Any:
 
 
 def keep_program(name: str | None, program: Any) -> Any:
-    """Keep a compiled program on disk, and return it."""
+    """Keep a program on disk that was compiled `without_compilation_cache`, and return it."""
     if name is None:
         return program
     path = _program_path(name)
@@ -173,13 +191,14 @@ def keep_program(name: str | None, program: Any) -> Any:
 def _program_path(name: str) -> Path:
     config, device = jax.config.values, jax.local_devices()[0]
     settings = [
-        jax.__version__, jaxlib.__version__, device.platform, device.device_kind, jax.local_device_count(),
-        platform.machine(), platform.processor(), os.environ.get("XLA_FLAGS"),
+        jax.__version__, jaxlib.version.__version__, device.platform, device.device_kind,
+        jax.local_device_count(), platform.machine(), platform.processor(), os.environ.get("XLA_FLAGS"),
         config["jax_enable_x64"], config["jax_default_prng_impl"], config["jax_threefry_partitionable"],
         config["jax_default_matmul_precision"],
     ]  # fmt: skip
     key = hashlib.sha256(repr((name, settings)).encode()).hexdigest()[:32]
-    return cache_directory() / "programs" / f"{key}.bin"
+    enable_compilation_cache()
+    return Path(config["jax_compilation_cache_dir"]) / "limsim_jax" / f"{key}.bin"
 
 
 def _forget(folder: Path) -> None:

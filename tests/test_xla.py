@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from limsim_jax import xla
 from limsim_jax.xla import (
@@ -111,26 +112,55 @@ def test_an_interval_is_within_its_count(count):
     np.testing.assert_array_equal(number, [0, count - 1])
 
 
-def test_kept_programs_are_loaded_without_a_trace(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIMSIM_JAX_CACHE", str(tmp_path))
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A cache of JAX for this test alone."""
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path / "limsim_jax"
+    jax.config.update("jax_compilation_cache_dir", before)
+    compilation_cache.reset_cache()
+
+
+def test_kept_programs_are_loaded_without_a_trace(folder):
     program = jax.jit(lambda x: {"twice": 2 * x}).lower(jnp.zeros(3)).compile()
     assert xla.load_program("twice") is None
     assert xla.keep_program("twice", program) is program
     found = xla.load_program("twice")
     np.testing.assert_array_equal(found(jnp.arange(3.0))["twice"], [0, 2, 4])
     assert xla.load_program("thrice") is None and xla.load_program(None) is None
-    (path,) = (tmp_path / "programs").iterdir()
+    (path,) = folder.iterdir()
     path.write_bytes(path.read_bytes()[:100])  # damaged: it is as if it were not there
     assert xla.load_program("twice") is None
 
 
-def test_programs_that_were_not_used_for_long_are_forgotten(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIMSIM_JAX_CACHE", str(tmp_path))
+def test_a_program_that_jax_has_in_its_cache_can_be_kept(folder):
+    def wave(x):
+        return jax.lax.fori_loop(0, 5, lambda _, y: jnp.sin(y) * 2 + jnp.roll(y, 1) * jnp.cumsum(y), x)
+
+    def compiled():
+        jax.clear_caches()
+        return jax.jit(wave).lower(x).compile()
+
+    x, least = jnp.linspace(0.0, 1.0, 1000), jax.config.values["jax_persistent_cache_min_compile_time_secs"]
+    try:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+        compilation_cache.reset_cache()
+        want = compiled()(x)
+        assert list(folder.parent.glob("*wave*"))
+        with xla.without_compilation_cache():
+            xla.keep_program("wave", compiled())
+    finally:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
+    np.testing.assert_array_equal(xla.load_program("wave")(x), want)
+
+
+def test_programs_that_were_not_used_for_long_are_forgotten(folder, monkeypatch):
     monkeypatch.setattr(xla, "PROGRAMS", 2)
     program = jax.jit(lambda x: x + 1).lower(1.0).compile()
     for name in ("a", "b", "a", "c"):
         if xla.load_program(name) is None:
             xla.keep_program(name, program)
-        for path in (tmp_path / "programs").iterdir():  # time passes
+        for path in folder.iterdir():  # time passes
             os.utime(path, (path.stat().st_atime, path.stat().st_mtime - 10))
     assert [xla.load_program(name) is not None for name in "abc"] == [True, False, True]

@@ -5,6 +5,7 @@ totals = Worlds(run, lane_map, sampler).run_totals(range(1000))
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -20,7 +21,13 @@ from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.simulation.rollout import KEPT, Result, Rollout, Started, started
 from limsim_jax.simulation.totals import Totals
 from limsim_jax.types import Scenario
-from limsim_jax.xla import enable_compilation_cache, keep_program, load_program, run_once
+from limsim_jax.xla import (
+    enable_compilation_cache,
+    keep_program,
+    load_program,
+    run_once,
+    without_compilation_cache,
+)
 
 
 def over_worlds(
@@ -30,7 +37,7 @@ def over_worlds(
     *,
     consumes: bool = False,
 ) -> Any:
-    """A function of what all worlds share and of one world, jitted for `[B, ...]` worlds.
+    """A function of shared data and one world, for `[B, ...]` worlds.
 
     The batch is divided among the devices of the mesh. `consumes`: the arrays of the worlds are used for
     those of the result, and are gone.
@@ -96,7 +103,8 @@ class Worlds:
         self._start_name = None if sampling is None or running is None else f"{self._advance_name} {sampling}"
         self._start_jit: Any = over_worlds(start, self.mesh, run_once())
         self._advance_jit: Any = over_worlds(advance, self.mesh, consumes=True)
-        self._start = self._advance = None
+        self._start: Any = None
+        self._advance: Any = None
 
     def compile(self) -> Worlds:
         """Get the programs ready; otherwise the first chunk does."""
@@ -105,7 +113,8 @@ class Worlds:
         enable_compilation_cache()
         seeds = jnp.zeros(self.chunk, jnp.int32)
 
-        with ThreadPoolExecutor(1) as pool, no_garbage_collection():
+        aside = contextlib.nullcontext() if self._advance_name is None else without_compilation_cache()
+        with ThreadPoolExecutor(1) as pool, no_garbage_collection(), aside:
             start = load_program(self._start_name)
             if start is None:
                 lowered = self._start_jit.lower(self.lane_map, seeds)
@@ -152,7 +161,7 @@ class Worlds:
         return self._in_chunks(worlds, run)
 
     def replay(self, worlds: Started, decisions: int | None = None) -> Result:
-        """Worlds `[W, ...]` for some decisions, or from their start to the horizon, on the host.
+        """Worlds `[W, ...]` to the horizon, or for some decisions.
 
         Records are those of every step, `[W, T, ...]`. All else is the same as in `run`, to the last bit.
         """
@@ -200,7 +209,7 @@ class Worlds:
 
 
 def _shapes(tree: Any) -> str:
-    """Shapes and types of the arrays of a tree, and what is static in it."""
+    """Shapes, types and static parts of a tree."""
     leaves, structure = jax.tree.flatten(tree)
     return f"{structure} {[(x.shape, str(x.dtype)) for x in leaves]}"
 

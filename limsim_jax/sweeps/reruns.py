@@ -49,7 +49,7 @@ class Changed(NamedTuple):
 
 
 class Reruns:
-    """Runs worlds of a sweep again, with changes, by the program of the sweep.
+    """Runs worlds of a sweep again by its program, with changes.
 
     Args:
       worlds: of a rollout that records `simulation.trace.trace` and whose policy is a `CanBrake`.
@@ -119,7 +119,7 @@ class Reruns:
         return found
 
     def module(self, seed: int, ego: int, metrics: dict[str, float], kind: str, seen: Trace) -> str | None:
-        """The modules of the policy that are to blame for a failure, joined by "or".
+        """The modules of the policy that are to blame, joined by "or".
 
         A policy made of modules (`policies.base.variants`) drives again with a reference in the place of each
         module, from the first unsafe moment on, or from `UNSAFE` s before the failure if that is later. A
@@ -154,7 +154,7 @@ class Reruns:
     def _with_reference(
         self, module: str, lane_map: LaneMap, world: Started, more: jax.Array, box: jax.Array
     ) -> Any:
-        """Metrics of a world after `more` decisions with a reference in place of a module."""
+        """Metrics after `more` decisions with a reference in place of a module."""
         run = self.rollout
         assert run.measure is not None
         other = variants(run.policy, Replayed(box, run.config.dt))[module]
