@@ -212,7 +212,7 @@ class Results:
         from limsim_jax.report.page import write_report
 
         def again(scenario: str, policy: str, seeds: Sequence[int]) -> Sequence[tuple[Any, ...]]:
-            return self.worlds_of(scenario, policy).replays([(seed, 0) for seed in seeds])
+            return self.worlds_of(scenario, policy).replays([(seed, 0) for seed in seeds], brief=True)
 
         target = self.path / "report.html" if path is None else Path(path)
         return write_report(self.stored, target, replayer=again, worst=worst, table=self._summary)

@@ -407,7 +407,7 @@ def _write_report(
     def again(scenario: str, policy: str, seeds: Sequence[int]) -> Sequence[tuple[Any, ...]]:
         group = scenario, policy
         episodes = known[group] if group in known else rebuild(results, *group)
-        return episodes.replays([(seed, 0) for seed in seeds])
+        return episodes.replays([(seed, 0) for seed in seeds], brief=True)
 
     write_report(results, path, replayer=again, worst=worst, seconds=seconds, say=print, table=table)
     print(f"wrote {path}")

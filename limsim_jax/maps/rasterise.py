@@ -66,11 +66,11 @@ _LEAST = {  # least sizes of tables, so that all small maps have the same shapes
     "lanes": 64,
     "rows": 4096,
     "neighbors": 4,
-    "chunks": 256,
-    "cells": 1024,
-    "candidates": 8192,
+    "chunks": 1024,
+    "cells": 8192,
+    "candidates": 24576,
     "connectors": 64,
-    "foes": 0,
+    "foes": 12,
     "goals": 16,
     "programs": 16,
     "phases": 16,
@@ -201,6 +201,8 @@ def _rule_tables(network: Network, goals: Goals | None, num_lanes: int) -> dict[
             "movements": len(signals.movement_link),
         }.items()
     }
+    if not foes:
+        size["foes"] = 0  # a program without conflicts is a third faster
     return {
         "conflicts": conflicts.pad(lanes=num_lanes, connectors=size["connectors"], foes=size["foes"]),
         "routes": routes.pad(lanes=num_lanes, goals=size["goals"]),

@@ -20,7 +20,7 @@ from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import lane_states_on_host
 from limsim_jax.report.draw import TRAFFIC_ZORDER, draw_network
 from limsim_jax.report.draw.painter import INK
-from limsim_jax.report.ending import ending, without_arrived
+from limsim_jax.simulation.ending import ending, without_arrived
 from limsim_jax.simulation.trace import Trace
 from limsim_jax.types import Status
 

@@ -17,9 +17,9 @@ from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.outline import Bounds
 from limsim_jax.report.draw.painter import INK
-from limsim_jax.report.ending import shown_steps
 from limsim_jax.report.frames import COLLIDED, EGO, SIGNALS, Scene, step_at
 from limsim_jax.report.stills import DPI, Camera, Captions, MapPage
+from limsim_jax.simulation.ending import shown_steps
 from limsim_jax.simulation.trace import Trace
 
 VIDEO_SUFFIXES = (".gif", ".mp4")

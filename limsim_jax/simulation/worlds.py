@@ -151,30 +151,46 @@ class Worlds:
         self.compile()
         return self._advance((self.lane_map, np.int32(decisions)), worlds)
 
-    def run(self, worlds: Started) -> Result:
-        """Worlds `[W, ...]` from their start to the horizon, on the host."""
+    def run(self, worlds: Started, decisions: int | None = None) -> Result:
+        """Run worlds `[W, ...]` to the horizon, or for some decisions.
+
+        The result is on the host."""
 
         def run(chunk: Started, _: int) -> Result:
-            result = self.advance(chunk, self.rollout.decisions)[1]
+            result = self.advance(chunk, self.rollout.decisions if decisions is None else decisions)[1]
             return jax.device_get(result._replace(trace=None))
 
         return self._in_chunks(worlds, run)
 
-    def replay(self, worlds: Started, decisions: int | None = None) -> Result:
+    def replay(
+        self,
+        worlds: Started,
+        decisions: int | None = None,
+        *,
+        count: int | None = None,
+        enough: Callable[[Any], bool] | None = None,
+    ) -> Result:
         """Worlds `[W, ...]` to the horizon, or for some decisions.
 
         Records are those of every step, `[W, T, ...]`. All else is the same as in `run`, to the last bit.
+
+        Args:
+          worlds: at their start.
+          decisions: None: to the horizon.
+          count: of the first worlds of a chunk, whose records alone are kept; None: all.
+          enough: given the next records of a chunk, `[W, t, ...]`; its run ends once it returns True.
         """
 
-        def run(chunk: Started, count: int) -> Result:
+        def run(chunk: Started, some: int) -> Result:
+            kept = some if count is None else min(count, some)
             result, records, left = None, [], self.rollout.decisions if decisions is None else decisions
             while left:
-                some = min(left, KEPT)
-                chunk, result = self.advance(chunk, some)
+                more = min(left, KEPT)
+                chunk, result = self.advance(chunk, more)
                 trace = jax.device_get(result.trace)
-                steps = some * self.rollout.config.decision_every
-                records.append(jax.tree.map(lambda x: x[:count, :steps], trace))  # noqa: B023
-                left -= some
+                steps = more * self.rollout.config.decision_every
+                records.append(jax.tree.map(lambda x: x[:kept, :steps].copy(), trace))  # noqa: B023
+                left = 0 if enough is not None and enough(records[-1]) else left - more
             assert result is not None
             whole = jax.device_get(result._replace(trace=None))
             return whole._replace(trace=jax.tree.map(lambda *x: np.concatenate(x, 1), *records))

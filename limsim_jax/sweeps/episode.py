@@ -28,6 +28,7 @@ from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos, EvaluateTraffic
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.policies.base import PolicyLike, check_policy, policy_name
+from limsim_jax.simulation.ending import Watch
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.totals import Totals
 from limsim_jax.simulation.trace import trace
@@ -56,6 +57,9 @@ _SHARE_OF_MEMORY = 0.25
 _TEMPORARIES = 12  # memory of a running world, in units of its arrays
 _CHUNKS = {"cpu": 50, "gpu": 2000, "tpu": 2000}
 """Worlds per call, if memory allows: round numbers of seeds leave no chunk half empty."""
+
+AFTERWARDS = 12.0
+"""s that a brief replay goes on without its ego: `UNSAFE` s, and the look-ahead of a planner at their end."""
 
 _NO_PART_OF_ROWS = ("api", "bench", "bench.py", "cli", "report")
 """Rooms whose code changes no row."""
@@ -297,18 +301,32 @@ class Episodes:
         """Run one world again and keep every step: see `replays`."""
         return self.replays([(seed, ego)], explain=explain)[0]
 
-    def replays(self, which: Sequence[tuple[int, int]], *, explain: bool = True) -> list[Replay]:
+    def replays(
+        self, which: Sequence[tuple[int, int]], *, explain: bool = True, brief: bool = False
+    ) -> list[Replay]:
         """Run worlds again and keep every step. They are those of the sweep, to the last bit.
 
         Args:
           which: seeds and egos, whose metrics and key moments are wanted.
           explain: find out which vehicle or module could have avoided the worst moment: see
             `Reruns.avoidable` and `Reruns.module`.
+          brief: run no longer than `AFTERWARDS` s after the egos have arrived or left; metrics of the
+            traffic are those up to there.
         """
         for _, ego in which:
             if not 0 <= ego < max(self.egos, 1):
                 raise ValueError(f"ego {ego}: the experiment has egos 0 to {self.egos - 1}")
-        result = self._reruns.replay([seed for seed, _ in which])
+        found = []
+        for first in range(0, len(which), self.chunk):
+            found += self._replayed(which[first : first + self.chunk], brief)
+        if explain:
+            self._explain([seed for seed, _ in which], found)
+        return found
+
+    def _replayed(self, which: Sequence[tuple[int, int]], brief: bool) -> list[Replay]:
+        """At most a chunk of replays."""
+        enough = Watch([ego for _, ego in which], AFTERWARDS) if brief else None
+        result = self._reruns.replay([seed for seed, _ in which], enough)
         columns = self._columns(result.measures, result.totals)
         found = []
         for k, (seed, ego) in enumerate(which):
@@ -321,8 +339,6 @@ class Episodes:
             values = {name: float(x[0]) for name, x in metrics.items()}
             slot = ego if self.egos else -1
             found.append(Replay(self.network, self.lane_map, seen, slot, rows, values))
-        if explain:
-            self._explain([seed for seed, _ in which], found)
         return found
 
     def _explain(self, seeds: Sequence[int], found: Sequence[Replay]) -> None:

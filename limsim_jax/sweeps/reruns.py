@@ -63,15 +63,21 @@ class Reruns:
             for module in variants(rollout.policy, constant_velocity)
         }
 
-    def replay(self, seeds: Sequence[int]) -> Result:
-        """Worlds with their traces, `[W, T, ...]`."""
-        return self._in_chunks(list(map(Changed, seeds)), self.worlds.replay)
+    def replay(self, seeds: Sequence[int], enough: Callable[[Any], bool] | None = None) -> Result:
+        """Worlds with their traces, `[W, T, ...]`.
 
-    def run(self, changed: Sequence[Changed]) -> Result:
+        `enough` is that of `Worlds.replay`; with it, one chunk at most."""
+
+        def run(worlds: Started, count: int) -> Result:
+            return self.worlds.replay(worlds, count=count, enough=enough)
+
+        return self._in_chunks(list(map(Changed, seeds)), run)
+
+    def run(self, changed: Sequence[Changed], decisions: int | None = None) -> Result:
         """Worlds with changes, `[W, ...]`, without traces."""
-        return self._in_chunks(changed, self.worlds.run)
+        return self._in_chunks(changed, lambda worlds, _: self.worlds.run(worlds, decisions))
 
-    def _in_chunks(self, changed: Sequence[Changed], run: Callable[[Started], Result]) -> Result:
+    def _in_chunks(self, changed: Sequence[Changed], run: Callable[[Started, int], Result]) -> Result:
         parts, size = [], self.worlds.chunk
         for first in range(0, len(changed), size):
             some = changed[first : first + size]
@@ -82,7 +88,7 @@ class Reruns:
             told = told._replace(
                 slot=jax.device_put(slot, told.slot.sharding), at=jax.device_put(at, told.at.sharding)
             )
-            result = run(worlds._replace(carry=worlds.carry._replace(memory=told)))
+            result = run(worlds._replace(carry=worlds.carry._replace(memory=told)), len(some))
             parts.append(jax.tree.map(lambda x: x[: len(some)], result))  # noqa: B023
         return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
@@ -107,7 +113,8 @@ class Reruns:
                 changed.append(Changed(seed, slot, start + Rss().response))
         if not changed:
             return []
-        measures = on_host(self.run(changed).measures)
+        last = max(metrics["contact_time"] for *_, metrics in failures) + UNSAFE
+        measures = on_host(self.run(changed, self._decisions(last)).measures)
         found = []
         for k, (_, ego, metrics) in enumerate(failures):
             found.append({})
@@ -140,16 +147,22 @@ class Reruns:
             start = max(start, min(unsafe, event))
         every = self.rollout.config.decision_time
         first = int(start / every)
-        more = min(math.ceil((event + UNSAFE) / every), self.rollout.decisions) - first
+        more = self._decisions(event + UNSAFE) - first
         chunk, _ = self.worlds.advance(self.worlds.start([seed]), first)
         world = jax.tree.map(lambda x: x[0], jax.device_get(chunk))
+        steps = self.rollout.decisions * self.rollout.config.decision_every
+        box = np.pad(seen.box, [(0, steps - len(seen.box)), (0, 0), (0, 0)], mode="edge")  # one shape for all
         blamed = []
         for module, advance in self._references.items():
-            measures = advance(self.worlds.lane_map, world, np.int32(more), seen.box)
+            measures = advance(self.worlds.lane_map, world, np.int32(more), box)
             single = jax.tree.map(lambda x: x[None], jax.device_get(measures))
             if np.isnan(of_ego(on_host(single), ego)[f"{kind}_time"][0]):
                 blamed.append(module)
         return " or ".join(blamed) or None
+
+    def _decisions(self, until: float) -> int:
+        """Decisions to a moment beyond `until` (s), or to the horizon."""
+        return min(math.ceil(until / self.rollout.config.decision_time) + 1, self.rollout.decisions)
 
     def _with_reference(
         self, module: str, lane_map: LaneMap, world: Started, more: jax.Array, box: jax.Array

@@ -3,6 +3,7 @@
 import sys
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -17,10 +18,10 @@ from limsim_jax.maps.lane_map import absolute, lane_rows
 from limsim_jax.maps.outline import signal_bars
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.report import video
-from limsim_jax.report.ending import ending
 from limsim_jax.report.frames import COLLIDED, EGO, SIGNALS, Scene, draw_frame
 from limsim_jax.report.stills import Camera, Captions, MapPage
 from limsim_jax.report.video import write_picture, write_video
+from limsim_jax.simulation.ending import Watch, ending
 from limsim_jax.simulation.trace import Trace
 
 
@@ -224,6 +225,23 @@ def test_an_ego_ends_where_it_arrives_or_leaves(world):
     assert ending(trace, LATE) == (5, False)  # another vehicle gets the slot
     left = trace._replace(active=trace.active & (np.arange(T)[:, None] < 7))
     assert ending(left, OWN) == (6, False)
+
+
+def test_a_watch_waits_for_the_last_ego_and_some_time_more(world):
+    _, _, trace = world
+    early, late = arriving(trace, 2), arriving(trace, 5)
+    both: Trace = jax.tree.map(lambda x, y: np.stack([x, y]), early, late)
+
+    def ends(trace: Trace, egos: list[int], after: float) -> int | None:
+        """The step after which the watch is content; it is told two steps at a time."""
+        watch, told = Watch(egos, after), range(2, T + 1, 2)
+        found = [watch(jax.tree.map(lambda x: x[:, k - 2 : k], trace)) for k in told]  # noqa: B023
+        return told[found.index(True)] if True in found else None
+
+    assert ends(both, [OWN, OWN], 0.0) == 8  # the last one arrives in the sixth step
+    assert ends(both, [OWN, OWN], 0.25) == 10  # steps are 0.1 s apart: by the ninth one
+    assert ends(both, [OWN, HIT], 0.0) is None  # the second is on the road to the end
+    assert ends(both._replace(driven=None), [OWN, OWN], 0.0) is None
 
 
 def test_an_ego_is_not_drawn_after_its_arrival(world, tmp_path):

@@ -1,6 +1,7 @@
 """From the engine to the metrics: what an episode is said to be, against loops over its trace."""
 
 import functools
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ from limsim_jax.maps.lane_map import NO_LANE
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import lane_states
 from limsim_jax.metrics.safety import encounter, overlaps
+from limsim_jax.sweeps import episode
 from limsim_jax.sweeps.episode import Episodes, _succeeds
 from limsim_jax.sweeps.experiment import Bounds, ExperimentFile
 from limsim_jax.sweeps.moments import key_moments
@@ -101,6 +103,25 @@ def test_the_module_that_is_to_blame():
     calm = next(seed for seed in SEEDS if not replayed("like_traffic", seed).metrics["contacts"])
     assert not any(row.get("module") for row in replayed("like_traffic", calm).moments)
     assert blind._reruns._references == {}
+
+
+def test_a_brief_replay_is_the_beginning_of_the_whole_one(monkeypatch):
+    run = episodes("like_traffic")
+    monkeypatch.setattr(episode, "AFTERWARDS", 1.0)
+    monkeypatch.setattr(run.worlds, "rollout", replace(run.worlds.rollout, horizon=150.0))  # egos arrive
+    which = [(seed, 0) for seed in SEEDS]
+    whole, brief = run.replays(which), run.replays(which, brief=True)
+    steps = len(brief[0].trace.time)
+    assert 100 < steps < len(whole[0].trace.time) == 1500, "otherwise this tells little"
+    for long, short in zip(whole, brief, strict=True):
+        for field, x, y in zip(long.trace._fields, long.trace, short.trace, strict=True):
+            assert (x is None) == (y is None)
+            if x is not None:
+                np.testing.assert_array_equal(x[:steps], y, err_msg=field)
+        assert str(long.moments) == str(short.moments)
+        of_traffic = {name for name in long.metrics if name.startswith("traffic_")}
+        for name in long.metrics.keys() - of_traffic:
+            np.testing.assert_equal(long.metrics[name], short.metrics[name], err_msg=name)
 
 
 @pytest.mark.parametrize("policy, seed", cases())

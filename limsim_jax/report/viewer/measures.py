@@ -23,43 +23,55 @@ _PAIRS = 2**18  # pairs of vehicles measured at once
 def measure(lane_map: LaneMap, trace: Any, valid: NDArray[np.bool_]) -> tuple[NDArray[Any], ...]:
     """Per vehicle `[T, N]`: leader, gap, 1-D TTC, least 2-D TTC and the slot (-1, `NO_GAP`, `NONE`)."""
     steps, slots = valid.shape
-    lane, start = _way_ahead(lane_map, trace, valid)
+    way, start = _way_ahead(lane_map, trace, valid)
     size = max(1, min(64, _PAIRS // slots**2))  # steps at once, the same for all traces with these slots
     found = []
     for k in range(0, steps, size):
         part = slice(k, min(k + size, steps))
-        lead, gap = _leaders(trace.s[part], trace.box[part, :, 3], valid[part], lane[part], start[part])
-        lead_v = np.where(lead >= 0, np.take_along_axis(trace.v[part], np.maximum(lead, 0), 1), 0)
-        arrays = [trace.box[part], trace.v[part], valid[part], gap, lead_v]
         spare = size - (part.stop - k)
+        arrays = [trace.box[part], trace.v[part], trace.s[part], valid[part], way[part], start[part]]
         arrays = [np.pad(x, [(0, spare)] + [(0, 0)] * (x.ndim - 1)) for x in arrays]
-        arrays = [x if x.dtype == bool else np.nan_to_num(x).astype(np.float32) for x in arrays]
-        times = [np.asarray(x)[: part.stop - k] for x in _times(*arrays)]
-        found.append((lead, gap, *times))
+        arrays = [np.nan_to_num(x).astype(np.float32) if x.dtype.kind == "f" else x for x in arrays]
+        found.append([np.asarray(x)[: part.stop - k] for x in _measured(*arrays)])
     return tuple(np.concatenate(x) for x in zip(*found, strict=True))
 
 
 @jax.jit
-def _times(
-    box: Float[Array, "K N 5"],
-    v: Float[Array, "K N"],
-    valid: Bool[Array, "K N"],
-    gap: Float[Array, "K N"],
-    v_lead: Float[Array, "K N"],
-) -> tuple[Float[Array, "K N"], Float[Array, "K N"], Int[Array, "K N"]]:
-    """1-D TTC behind the leader; least 2-D TTC, and with which slot."""
+@jax.vmap
+def _measured(
+    box: Float[Array, "N 5"],
+    v: Float[Array, " N"],
+    s: Float[Array, " N"],
+    valid: Bool[Array, " N"],
+    way: Int[Array, "N D"],
+    start: Float[Array, "N D"],
+) -> tuple[Int[Array, " N"], Float[Array, " N"], Float[Array, " N"], Float[Array, " N"], Int[Array, " N"]]:
+    """Leader and gap, 1-D TTC behind it; least 2-D TTC, and with which slot."""
+    apart = valid[:, None] & valid[None, :] & ~jnp.eye(len(v), dtype=bool)
+    lead, gap = _leaders(s, box[:, 3], apart, way, start)
+    velocity = v[:, None] * jnp.stack([jnp.cos(box[:, 2]), jnp.sin(box[:, 2])], -1)
+    pairs = jax.vmap(encounter, (0, 0, None, None))(box, velocity, box, velocity)
+    ttc = jnp.where(apart, ttc_2d(pairs), NONE)
+    least, other = jnp.min(ttc, -1), jnp.argmin(ttc, -1).astype(jnp.int32)
+    behind = ttc_1d(gap, v, jnp.where(lead >= 0, v[lead], 0))
+    return lead, gap, behind, least, jnp.where(least < NONE, other, -1)
 
-    def step(
-        box: Float[Array, "N 5"], v: Float[Array, " N"], valid: Bool[Array, " N"]
-    ) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
-        velocity = v[:, None] * jnp.stack([jnp.cos(box[:, 2]), jnp.sin(box[:, 2])], -1)
-        pairs = jax.vmap(encounter, (0, 0, None, None))(box, velocity, box, velocity)
-        apart = valid[:, None] & valid[None, :] & ~jnp.eye(len(v), dtype=bool)
-        ttc = jnp.where(apart, ttc_2d(pairs), NONE)
-        least, other = jnp.min(ttc, -1), jnp.argmin(ttc, -1).astype(jnp.int32)
-        return least, jnp.where(least < NONE, other, -1)
 
-    return ttc_1d(gap, v, v_lead), *jax.vmap(step)(box, v, valid)
+def _leaders(
+    s: Float[Array, " N"],
+    length: Float[Array, " N"],
+    apart: Bool[Array, "N N"],
+    way: Int[Array, "N D"],
+    start: Float[Array, "N D"],
+) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
+    """Leader (slot, -1: none) and the gap to its rear (m)."""
+    ahead = start[:, :, None] + s[None, None, :]  # [N, D, N], m to the front of the other
+    there = (way[None, None, :, 0] == way[:, :, None]) & (way != NO_LANE)[:, :, None] & apart[:, None, :]
+    flat = jnp.where(there & (ahead > 0), ahead, jnp.inf).reshape(len(s), -1)
+    nearest, lead = jnp.min(flat, -1), jnp.argmin(flat, -1).astype(jnp.int32) % len(s)
+    gap = nearest - length[lead]
+    found = gap < LOOK_AHEAD
+    return jnp.where(found, lead, -1), jnp.where(found, gap, NO_GAP)
 
 
 def _way_ahead(
@@ -89,29 +101,3 @@ def _way_ahead(
     length = np.where(way == NO_LANE, 0.0, np.asarray(lane_map.length, float)[way])
     start = np.cumsum(length, -1) - length - np.nan_to_num(trace.s.astype(float))[..., None]
     return way, start
-
-
-def _leaders(
-    s: NDArray[Any],
-    length: NDArray[Any],
-    valid: NDArray[np.bool_],
-    way: NDArray[np.int64],
-    start: NDArray[np.float64],
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Leader (slot, -1: none) and the gap to its rear (m), `[K, N]`."""
-    lane = way[..., 0]
-    nearest = np.full(s.shape, np.inf)
-    lead = np.full(s.shape, -1)
-    myself = np.eye(s.shape[1], dtype=bool)
-    for i in range(way.shape[-1]):
-        ahead = start[..., i, None] + s[:, None, :]  # [K, N, N], m to the front of the other
-        there = (lane[:, None, :] == way[..., i, None]) & (way[..., i, None] != NO_LANE)
-        there &= valid[:, None, :] & ~myself & (ahead > 0)
-        ahead = np.where(there, ahead, np.inf)
-        nearby = ahead.argmin(-1)
-        distance = np.take_along_axis(ahead, nearby[..., None], -1)[..., 0]
-        lead = np.where(distance < nearest, nearby, lead)
-        nearest = np.minimum(distance, nearest)
-    gap = nearest - np.where(lead >= 0, np.take_along_axis(length, np.maximum(lead, 0), 1), 0)
-    lead = np.where(gap < LOOK_AHEAD, lead, -1)
-    return lead, np.where(lead >= 0, gap, NO_GAP)

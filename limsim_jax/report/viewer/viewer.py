@@ -26,12 +26,12 @@ from limsim_jax.maps.lane_map import VEHICLE_CLASSES, LaneMap, absolute, lane_id
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.metrics.moments import RESPONSIBLE, value_text, words
-from limsim_jax.report.ending import ending, shown_steps, without_arrived
 from limsim_jax.report.frames import COLLIDED, DRIVEN, EGO, SIGNALS
 from limsim_jax.report.templates import read, render
 from limsim_jax.report.viewer.pack import Pack, held, origin
 from limsim_jax.report.viewer.roads import add_map
 from limsim_jax.report.viewer.traffic import add_driven, add_traffic
+from limsim_jax.simulation.ending import ending, shown_steps, without_arrived
 from limsim_jax.simulation.trace import Trace
 from limsim_jax.types import Status
 
@@ -146,7 +146,7 @@ def write_viewer(
 
 def _write(path: Path, meta: dict[str, Any], pack: Pack) -> None:
     head = json.dumps(meta | {"columns": pack.columns}, separators=(",", ":"), allow_nan=False).encode()
-    block = zlib.compress(len(head).to_bytes(4, "little") + head + b"".join(pack.parts), 9)
+    block = zlib.compress(len(head).to_bytes(4, "little") + head + b"".join(pack.parts), 6)
     page = render(
         "viewer/viewer.html.j2",
         title=meta["title"],

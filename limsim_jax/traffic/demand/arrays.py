@@ -8,6 +8,12 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 from limsim_jax.traffic.vehicles import Population
 from limsim_jax.types import Driver, Shape
 
+LEAST_ROWS = 512
+"""Rows of a schedule, at least: small demands share compiled programs."""
+
+LEAST_ORIGINS = 8
+"""Lanes on which vehicles come in, at least."""
+
 NEVER = 1e9
 """s, time of unused rows of a schedule."""
 

@@ -17,7 +17,14 @@ from limsim_jax.maps.lane_map import (
     bucket,
 )
 from limsim_jax.maps.network import Network
-from limsim_jax.traffic.demand.arrays import NEVER, Demand, EgoStart, draw_number
+from limsim_jax.traffic.demand.arrays import (
+    LEAST_ORIGINS,
+    LEAST_ROWS,
+    NEVER,
+    Demand,
+    EgoStart,
+    draw_number,
+)
 from limsim_jax.traffic.demand.flows import Flow, Stream, streams_of
 from limsim_jax.traffic.demand.seats import lay_out_seats
 from limsim_jax.traffic.demand.tables import Tables, cumulative
@@ -84,7 +91,8 @@ def _lay_out(tables: Tables, streams: list[Stream]) -> dict[str, Any]:
     origin_of = np.array([lanes.index(stream.row) for stream in streams], int)
     capacity = np.array([stream.capacity() for stream in streams], int)
     rows = int(capacity.sum())
-    num_streams, num_origins, num_rows = bucket(len(streams), 4), bucket(len(lanes), 4), bucket(rows, 64)
+    num_streams = bucket(len(streams), 4)
+    num_origins, num_rows = bucket(len(lanes), LEAST_ORIGINS), bucket(rows, LEAST_ROWS)
 
     def of_streams(values: list[Any], fill: Any, dtype: Any) -> NDArray[Any]:
         table = np.full((num_streams, *np.shape(fill)), fill, dtype)

@@ -16,7 +16,7 @@ from limsim_jax.maps.network import Lane, MapError, Network
 from limsim_jax.maps.route_table import RouteTable
 from limsim_jax.maps.routing import build_fixed_routes, build_routes
 from limsim_jax.maps.sumo.records import Demand, Flow, Vehicle, VehicleType
-from limsim_jax.traffic.demand.arrays import NEVER
+from limsim_jax.traffic.demand.arrays import LEAST_ORIGINS, LEAST_ROWS, NEVER
 from limsim_jax.traffic.demand.sample import departure_place, entry_speed, typical_vehicles
 from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import from_vtypes, sample_vehicles
@@ -424,7 +424,7 @@ def _scenario(
 ) -> Scenario:
     """A scenario of empty roads and departures, sorted by lane and time."""
     lanes = sorted({d.row for d in placed})
-    rows, origins = bucket(len(placed), 64), bucket(len(lanes), 4)
+    rows, origins = bucket(len(placed), LEAST_ROWS), bucket(len(lanes), LEAST_ORIGINS)
 
     def table(values: list[float], fill: float, dtype: type) -> NDArray[np.generic]:
         return np.array(values + [fill] * (rows - len(values)), dtype)

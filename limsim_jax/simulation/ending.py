@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,3 +65,35 @@ def shown_steps(time: NDArray[Any], end: Ending | None, moments: NDArray[Any] | 
     if moments is not None and moments.size:
         until = max(until, float(np.max(moments)) + AFTER)
     return int(np.searchsorted(time, until + 1e-6, side="right"))
+
+
+class Watch:
+    """Tells when all egos have been gone for some time.
+
+    Args:
+      egos: slot of the ego of each world.
+      after: s that a world goes on without its ego.
+    """
+
+    def __init__(self, egos: Sequence[int], after: float) -> None:
+        self.egos, self.after = egos, after
+        self._seen: list[list[Trace]] = [[] for _ in egos]
+
+    def __call__(self, records: Trace) -> bool:
+        """Whether it is so. Without egos it never is.
+
+        Args:
+          records: the next steps of all worlds, `[W, T, ...]`.
+        """
+        if records.driven is None or records.to_go is None:
+            return False
+        gone = True
+        for k, (ego, seen) in enumerate(zip(self.egos, self._seen, strict=True)):
+            fields: dict[str, Any] = dict.fromkeys(Trace._fields)
+            fields |= {name: getattr(records, name)[k] for name in ("time", "to_go", "driven")}
+            fields |= {name: getattr(records, name)[k, :, : ego + 1] for name in ("active", "vehicle")}
+            seen.append(Trace(**fields))
+            seen[:] = [jax.tree.map(lambda *x: np.concatenate(x), *seen)]
+            end = ending(seen[0], ego)
+            gone &= end is not None and bool(seen[0].time[-1] > seen[0].time[end.step] + self.after)
+        return gone
