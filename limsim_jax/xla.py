@@ -12,6 +12,7 @@ import hashlib
 import os
 import pickle
 import platform
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -138,6 +139,14 @@ def enable_compilation_cache() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 
+class _Aside:
+    """Threads that want JAX's cache left alone; whether it was on before them."""
+
+    lock = threading.Lock()
+    threads = 0
+    before = True
+
+
 @contextlib.contextmanager
 def without_compilation_cache() -> Iterator[None]:
     """JAX's own cache is neither read nor written within, in any thread.
@@ -145,14 +154,43 @@ def without_compilation_cache() -> Iterator[None]:
     Why: a program for CPUs that JAX has read from its cache cannot be kept: once written and read again, it
     lacks some of its functions, and fails where it runs.
     """
-    before = jax.config.values["jax_enable_compilation_cache"]
-    jax.config.update("jax_enable_compilation_cache", False)
-    compilation_cache.reset_cache()  # or JAX goes by what it has seen in the first place
+
+    def switch(on: bool) -> None:
+        jax.config.update("jax_enable_compilation_cache", on)
+        compilation_cache.reset_cache()  # or JAX goes by what it has seen in the first place
+
+    with _Aside.lock:
+        if _Aside.threads == 0:
+            _Aside.before = jax.config.values["jax_enable_compilation_cache"]
+            switch(False)
+        _Aside.threads += 1
     try:
         yield
     finally:
-        jax.config.update("jax_enable_compilation_cache", before)
-        compilation_cache.reset_cache()
+        with _Aside.lock:
+            _Aside.threads -= 1
+            if _Aside.threads == 0:
+                switch(_Aside.before)
+
+
+def shared_program(name: str | None, compiled: Callable[[], Any]) -> Any:
+    """The program of a name, from disk or compiled; threads that want the same one wait for the first.
+
+    Args:
+      name: see `load_program`; None: it is compiled.
+      compiled: compiles it, `without_compilation_cache`.
+    """
+    if name is None:
+        return compiled()
+    with _program_lock(name):
+        found = load_program(name)
+        return keep_program(name, compiled()) if found is None else found
+
+
+@functools.cache
+def _program_lock(name: str) -> threading.Lock:
+    del name
+    return threading.Lock()
 
 
 def load_program(name: str | None) -> Any:

@@ -1,6 +1,8 @@
 """Every compiler trick does what it is for, in the compiled program or in the numbers."""
 
 import os
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -153,6 +155,38 @@ def test_a_program_that_jax_has_in_its_cache_can_be_kept(folder):
     finally:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
     np.testing.assert_array_equal(xla.load_program("wave")(x), want)
+
+
+def test_jax_gets_its_cache_back_when_the_last_thread_is_done():
+    def on() -> bool:
+        return jax.config.values["jax_enable_compilation_cache"]
+
+    assert on()
+    first, second = xla.without_compilation_cache(), xla.without_compilation_cache()
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert not on(), "the second thread still compiles"
+    second.__exit__(None, None, None)
+    assert on()
+
+
+def test_threads_that_want_the_same_program_compile_it_once(folder):
+    compiled = []
+
+    def compile_it(name: str):
+        compiled.append(name)
+        time.sleep(0.05)
+        return jax.jit(lambda x: x + len(name)).lower(1.0).compile()
+
+    names = ["one", "three", "one", "three", "one"]
+    with ThreadPoolExecutor(5) as pool:
+        found = list(pool.map(lambda name: xla.shared_program(name, lambda: compile_it(name)), names))
+    assert sorted(compiled) == ["one", "three"]
+    assert [float(program(1.0)) for program in found] == [4, 6, 4, 6, 4]
+    for _ in range(2):
+        xla.shared_program(None, lambda: compile_it("apart"))
+    assert compiled[2:] == ["apart", "apart"]
 
 
 def test_programs_that_were_not_used_for_long_are_forgotten(folder, monkeypatch):

@@ -46,7 +46,7 @@ SECONDS = 60.0
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    for command in (sweep, report, compare, verify, replay):
+    for command in (sweep, warm, report, compare, verify, replay):
         app.command()(command)
 
 
@@ -137,6 +137,36 @@ def sweep(
         opened, table = _print_headline(folder)
         if html:
             _write_report(opened, table, folder / "report.html", IN_SWEEP, SECONDS, made)
+
+
+def warm(
+    experiment: ExperimentArgument,
+    policy: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Drive the ego by this policy instead.")
+    ] = None,
+    map_file: Annotated[
+        str | None, typer.Option("--map", metavar="MAP", help="Use this map, not that of the file.")
+    ] = None,
+    chunk: Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")] = None,
+) -> None:
+    """Compile the programs of an experiment now; sweeps of any number of seeds then start at once."""
+    from concurrent.futures import ThreadPoolExecutor, as_completed
+
+    from limsim_jax.files import cache_directory
+    from limsim_jax.sweeps.experiment import read_experiments
+    from limsim_jax.sweeps.runner import COMPILERS
+
+    if chunk is not None and chunk < 1:
+        raise typer.BadParameter(f"{chunk}; at least 1", param_hint="--chunk")
+    begin = time.perf_counter()
+    made = build(read_experiments(experiment, map_file=map_file, policy=policy), chunk)
+    with ThreadPoolExecutor(COMPILERS) as pool:
+        jobs = {pool.submit(one.compile): one for one in made}
+        for job in as_completed(jobs):
+            job.result()
+            one = jobs[job]
+            print(f"{one.scenario} / {one.policy}: ready after {time.perf_counter() - begin:.0f} s")
+    print(f"programs are kept in {cache_directory()}")
 
 
 def report(

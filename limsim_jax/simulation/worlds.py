@@ -26,6 +26,7 @@ from limsim_jax.xla import (
     keep_program,
     load_program,
     run_once,
+    shared_program,
     without_compilation_cache,
 )
 
@@ -123,10 +124,8 @@ class Worlds:
             else:
                 kept, worlds = None, start.out_info
             name = None if self._advance_name is None else f"{self._advance_name} {_shapes(worlds)}"
-            advance = load_program(name)
-            if advance is None:
-                shared = self.lane_map, np.int32(0)
-                advance = keep_program(name, self._advance_jit.lower(shared, worlds).compile())
+            shared = self.lane_map, np.int32(0)
+            advance = shared_program(name, lambda: self._advance_jit.lower(shared, worlds).compile())
             self._start, self._advance = start if kept is None else kept.result(), advance
         return self
 

@@ -43,8 +43,8 @@ from limsim_jax.sweeps.store import (
 LOOKS_FROM = 128
 """Worlds, rounded up to whole chunks, before the first look at an interval."""
 
-COMPILERS = 2
-"""Scenarios that compile at the same time."""
+COMPILERS = 3
+"""Scenarios that compile at the same time; of those that share a program, all but one wait."""
 
 LEVEL = 0.95
 """Probability that no look at an interval misses."""

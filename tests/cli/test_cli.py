@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 import limsim_jax as lj
 from limsim_jax import cli
+from limsim_jax.files import cache_directory
 from limsim_jax.maps import bundled_map, bundled_maps, read_network
 from limsim_jax.sweeps import runner
 
@@ -273,6 +274,29 @@ def test_a_sweep_that_is_stopped_says_what_is_kept(run, tmp_path, monkeypatch):
     code, out, err = run("sweep", "roundabout", "--out", tmp_path)
     assert code == 130 and err == ""
     assert out.splitlines()[-1] == f"stopped; 53 worlds are kept in {tmp_path}; the same command goes on"
+
+
+def test_warm_compiles_every_scenario_of_the_file(run, monkeypatch):
+    compiled = []
+
+    class Waiting:
+        policy = "like_traffic"
+
+        def __init__(self, experiment):
+            self.scenario = experiment.name
+
+        def compile(self):
+            compiled.append(self.scenario)
+
+    monkeypatch.setattr("limsim_jax.cli.results.build", lambda read, chunk: [Waiting(x) for x in read])
+    code, out, err = run("warm", "paper")
+    assert (code, err) == (0, "")
+    scenarios = ["highway", "intersection", "long_route", "ramp", "roundabout"]
+    assert sorted(compiled) == scenarios
+    *ready, folder = out.splitlines()
+    assert sorted(line.partition(" / like_traffic: ready after ")[0] for line in ready) == scenarios
+    assert folder == f"programs are kept in {cache_directory()}"
+    assert run("warm", "paper", "--chunk", "0")[0] != 0
 
 
 def test_bug_is_a_traceback(run, write, monkeypatch):
