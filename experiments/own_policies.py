@@ -16,7 +16,7 @@ from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.policies.base import Policy
 from limsim_jax.policies.host import HostPolicy
 from limsim_jax.policies.reference import reference_path
-from limsim_jax.traffic.engine import Command
+from limsim_jax.traffic.command import Command
 
 
 @dataclass(frozen=True)

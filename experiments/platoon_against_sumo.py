@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from limsim_jax.maps import build_lane_map, read_network
 from limsim_jax.traffic.car_following import IDM
+from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Control, Limits, from_lane
-from limsim_jax.traffic.engine import Command, Traffic, drive
+from limsim_jax.traffic.engine import Traffic, drive
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config, Driver, Shape, State

@@ -33,7 +33,7 @@ from limsim_jax.policies.pdm.learned import (
 from limsim_jax.simulation.rollout import started
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import read_experiments
-from limsim_jax.traffic.engine import Command
+from limsim_jax.traffic.command import Command
 from limsim_jax.types import Config, State
 from limsim_jax.xla import enable_compilation_cache
 

@@ -17,7 +17,7 @@ from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.host import Kind, Observation, Observe, command_from
 from limsim_jax.simulation.rollout import Carry, Rollout
 from limsim_jax.sweeps.experiment import ExperimentError
-from limsim_jax.traffic.engine import Command
+from limsim_jax.traffic.command import Command
 from limsim_jax.types import Config, Schedule, State, Status
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class EnvState:
     carry: Carry
     schedule: Schedule
     key: Key[Array, ""]  # of the world
-    ended: Array  # [E], the ego has collided, left the road or arrived
+    ended: Array  # [E], the ego has collided, left the road or arrived, or its action was broken
 
     @property
     def world(self) -> State:
@@ -46,6 +46,7 @@ class Info(NamedTuple):
     collided: Array  # bool, so far
     off_road: Array  # bool, so far
     arrived: Array  # bool
+    broken: Array  # bool, an action so far was not finite
     time: Float[Array, ""]  # s
 
 
@@ -57,11 +58,11 @@ Reward = Callable[[Info, Info], Float[Array, " E"]]
 class ProgressReward:
     """Scaled progress to the goal, less a penalty for collisions.
 
-    Departures from the road count as collisions do; the arrival earns a bonus.
+    Departures from the road and broken actions count as collisions do; the arrival earns a bonus.
 
     Attributes:
       scale: m per unit of reward.
-      penalty: for a new collision or departure.
+      penalty: for a new collision, departure or broken action.
       bonus: for the arrival.
     """
 
@@ -72,6 +73,7 @@ class ProgressReward:
     def __call__(self, before: Info, now: Info) -> Float[Array, " E"]:
         """The reward of a step, `[E]`."""
         fresh = (now.collided & ~before.collided) | (now.off_road & ~before.off_road)
+        fresh |= now.broken & ~before.broken
         arrived = now.arrived & ~before.arrived
         return (
             now.progress / self.scale
@@ -99,6 +101,8 @@ class Env:
     - "trajectory": `x`, `y` (m), `heading` (rad), `v` (m/s), `[E, samples]`, in the frame of the ego, every
       `sample_time` s from now on;
     - "meta": `meta`, `[E]`, of `traffic.ego.Meta`; -1 drives like the traffic.
+
+    An action that is not finite ends the episode of its ego, which brakes.
 
     Args:
       experiment: with at least one ego; an `Experiment`, a name or a file.
@@ -179,7 +183,7 @@ class Env:
         _, after = self._run.advance(self.lanes, state.schedule, state.key, carry, 1)
         after = after._replace(memory=Command())
         last, now = self._info(before, before), self._info(before, after.state)
-        over = state.ended | now.collided | now.off_road | now.arrived
+        over = state.ended | now.collided | now.off_road | now.arrived | now.broken
         reward = jnp.where(state.ended, 0.0, self.reward(last, now))
         truncated = after.state.step >= self._run.decisions * self.config.decision_every
         new = EnvState(carry=after, schedule=state.schedule, key=state.key, ended=over)
@@ -191,13 +195,15 @@ class Env:
         slot = before.egos.slot
         status = jnp.where(after.active[slot], after.status[slot], after.status[slot] | before.status[slot])
         gone = before.active[slot] & ~after.active[slot]
-        collided, off_road = ((status & int(bit)) != 0 for bit in (Status.COLLIDED, Status.OFF_ROAD))
+        bits = (Status.COLLIDED, Status.OFF_ROAD, Status.NOT_FINITE)
+        collided, off_road, broken = ((status & int(bit)) != 0 for bit in bits)
         ahead = self._to_go(before) - jnp.where(gone, 0.0, self._to_go(after))
         return Info(
             progress=jnp.where(jnp.isfinite(ahead), ahead, 0.0),
             collided=collided,
             off_road=off_road,
             arrived=~after.active[slot] & ~collided,
+            broken=broken,
             time=self.config.time(after.step),
         )
 

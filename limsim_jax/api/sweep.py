@@ -31,6 +31,8 @@ def sweep(
     chunk: int | None = None,
     shard: tuple[int, int] | None = None,
     until_ci: tuple[float, str] | None = None,
+    on_error: runner.OnError = "record",
+    fresh: bool = False,
     progress: bool = True,
 ) -> Results:
     """Run experiments with many seeds, each under every policy.
@@ -50,11 +52,15 @@ def sweep(
       chunk: worlds per call; None: as memory allows.
       shard: (i, n): only every n-th chunk from the i-th on, for job arrays.
       until_ci: (half-width, metric): stop once the interval of the metric is that narrow.
+      on_error: "record": an episode in which the policy raises an exception or gives a command that is not
+        finite is a failed episode (`policy_failed`); "stop": it ends the sweep.
+      fresh: remove what `out` holds of these experiments and policies, and start anew.
       progress: show a progress bar.
 
     Raises:
       ExperimentError: an experiment that cannot run; one line.
       ValueError: seeds, shard or until_ci out of range, or two policies of one name.
+      PolicyFailedError: the policy failed, with `on_error="stop"`.
       ResultsError: `out` cannot be written, or holds results that were made differently.
     """
     use_all_cores()
@@ -73,7 +79,10 @@ def sweep(
     path = Path(tempfile.mkdtemp(prefix="limsim-jax-") if out is None else out)
     try:
         with progress_bar(progress) as show:
-            runner.sweep(episodes, chosen, path, shard=shard, until_ci=until_ci, progress=show)
+            runner.sweep(
+                episodes, chosen, path, shard=shard, until_ci=until_ci, progress=show, on_error=on_error,
+                fresh=fresh,
+            )  # fmt: skip
         found = Results(open_results(path))
     except BaseException:
         if out is None:

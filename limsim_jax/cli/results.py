@@ -7,6 +7,7 @@ import json
 import math
 import time
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,6 +36,13 @@ JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help=
 PolicyOption = Annotated[
     str | None, typer.Option(metavar="NAME", help="Policy, where the results hold several.")
 ]
+
+
+class OnError(StrEnum):
+    """What a sweep does with an episode in which the policy fails."""
+
+    RECORD = "record"
+    STOP = "stop"
 
 
 IN_SWEEP = 6
@@ -81,9 +89,18 @@ def sweep(
     address: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Ray cluster.  [default: this machine]")
     ] = None,
+    on_error: Annotated[
+        OnError,
+        typer.Option(help="An episode in which the policy fails is recorded as failed, or stops the sweep."),
+    ] = OnError.RECORD,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Remove what is there of this experiment, and start anew.")
+    ] = False,
     html: Annotated[bool, typer.Option("--report/--no-report", help="Write the report at the end.")] = True,
 ) -> None:
-    """Run an experiment with many seeds; go on where an earlier run has stopped."""
+    """Run an experiment with many seeds; go on where an earlier run has stopped.
+
+    The exit code is 1 if the policy failed in an episode."""
     from limsim_jax.sweeps.experiment import read_experiments
 
     part, stop = _shard(shard), _until(until_ci)
@@ -93,11 +110,14 @@ def sweep(
         raise typer.BadParameter(f"{chunk}; at least 1", param_hint="--chunk")
     if workers is not None and workers < 1:
         raise typer.BadParameter(f"{workers}; at least 1", param_hint="--workers")
+    if fresh and part is not None:
+        raise typer.BadParameter("it would remove the results of other shards", param_hint="--fresh")
     experiments = read_experiments(experiment, map_file=map_file, policy=policy)
     folder = Path("results") / Path(experiment).stem if out is None else out
     begin = time.perf_counter()
 
     from limsim_jax.api.progress import progress_bar
+    from limsim_jax.report.tables import failed_policies
     from limsim_jax.sweeps import runner
 
     kept: dict[tuple[str, str], int] = {}
@@ -116,10 +136,13 @@ def sweep(
                 factory = functools.partial(build, experiments, chunk, cores=1)
                 summary = sweep_on_ray(
                     factory, range(seeds), folder, workers=workers, address=address, shard=part,
-                    until_ci=stop, progress=tell,
+                    until_ci=stop, progress=tell, on_error=on_error.value, fresh=fresh,
                 )  # fmt: skip
             else:
-                summary = runner.sweep(made, range(seeds), folder, shard=part, until_ci=stop, progress=tell)
+                summary = runner.sweep(
+                    made, range(seeds), folder, shard=part, until_ci=stop, progress=tell,
+                    on_error=on_error.value, fresh=fresh,
+                )  # fmt: skip
     except KeyboardInterrupt:
         print(f"stopped; {sum(kept.values())} worlds are kept in {folder}; the same command goes on")
         raise
@@ -137,6 +160,9 @@ def sweep(
         opened, table = _print_headline(folder)
         if html:
             _write_report(opened, table, folder / "report.html", IN_SWEEP, SECONDS, made)
+        if failed := failed_policies(opened):
+            print("\n".join(failure.text for failure in failed))
+            raise typer.Exit(1)
 
 
 def warm(
@@ -307,6 +333,7 @@ def replay(
     world = World.run(rebuild(opened, *group), seed)
     for row in world.moments:
         value = "" if math.isnan(row["value"]) else f", {row['value']:.2f}"
+        value += f": {row['reason']}" if row.get("reason") else ""
         who = f", responsible: {row['responsible']}" if row["responsible"] else ""
         able = [name for name in ("ego", "other") if row.get(f"avoidable_by_{name}")]
         saved = f", had braked in time, would have avoided it: {' or '.join(able)}" if able else ""

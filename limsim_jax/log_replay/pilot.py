@@ -16,8 +16,8 @@ from limsim_jax.log_replay.arrays import SceneArrays
 from limsim_jax.log_replay.takeover import Ego, Flight, Moment
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, to_frenet
 from limsim_jax.policies.base import PolicyLike
+from limsim_jax.traffic.command import Command, hold_and_brake, without_broken
 from limsim_jax.traffic.ego import Control, Limits, step_free, track
-from limsim_jax.traffic.engine import Command
 from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config, Egos, Shape, State
 
@@ -100,23 +100,26 @@ class PolicyPilot:
         command, policy = lax.cond(
             t % self.decision_every == 0, decide, lambda: (memory.command, memory.policy)
         )
+        own, sound, broken = without_broken(own, command)
         # until its first decision the ego goes on as it was
         decided = t % self.decision_every == 0
         time = config.time(t)
-        if command.trajectory is not None:
-            control = track(config, self.limits, own, command.trajectory, time)
+        if sound.trajectory is not None:
+            control = track(config, self.limits, own, sound.trajectory, time)
         else:
-            control = command.control
+            assert sound.control is not None  # as `init` has found
+            control = sound.control
         hold = Control(acceleration=own.egos.a, steering=own.egos.steering)
         knows = flight.flying | decided
+        own, control = hold_and_brake(self.limits, own, control, broken)
         control = jax.tree.map(lambda new, old: jnp.where(knows, new, old), control, hold)
         moved = step_free(config, self.lane_map, self.limits, own, control)
         egos = moved.egos
         place = jnp.stack([egos.x[0], egos.y[0], egos.heading[0]])
         then = time + dt + _GRID * jnp.arange(1, PLANNED + 1, dtype=time.dtype)
         plan = _straight(place, moved.v[0])
-        if command.trajectory is not None:
-            ahead: Array = command.trajectory.at(then)[0, :, :3]
+        if sound.trajectory is not None:
+            ahead: Array = sound.trajectory.at(then)[0, :, :3]
             plan = jnp.where(knows, ahead, plan)
         return Flight(
             flying=flying, x=place[0], y=place[1], heading=place[2], v=moved.v[0], a=moved.a[0], plan=plan,

@@ -17,7 +17,7 @@ from limsim_jax.metrics.measure import Metric
 
 
 def _total(name: str, meaning: str, better: Better, kind: Kind = "mean", label: str = "") -> Description:
-    headline = Headline(14, label) if label else None
+    headline = Headline(15, label) if label else None
     return Description(f"traffic_{name}", meaning, "Traffic", better, kind, headline=headline)
 
 
@@ -54,40 +54,40 @@ DERIVED = (
     Description(
         "had_contact", "1 if the ego touched another body", "Safety", "lower", "proportion",
         formula="contacts > 0.",
-        headline=Headline(3, "episodes with a contact", **_PERCENT),
+        headline=Headline(4, "episodes with a contact", **_PERCENT),
         of="contacts",
     ),
     Description(
         "had_at_fault_contact", "1 if it did by its own fault by nuPlan's rules", "Safety", "lower",
         "proportion",
         formula="at_fault_contacts > 0.",
-        headline=Headline(4, "contacts at fault (nuPlan)", **_PERCENT),
+        headline=Headline(5, "contacts at fault (nuPlan)", **_PERCENT),
         of="at_fault_contacts",
     ),
     Description(
         "had_near_miss", "1 if the TTC fell below 1.5 s and no contact came of it", "Safety", "lower",
         "proportion",
         formula="near_misses > 0.",
-        headline=Headline(6, "episodes with a near miss", **_PERCENT),
+        headline=Headline(7, "episodes with a near miss", **_PERCENT),
         of="near_misses",
     ),
     Description(
         "left_road", "1 if the ego was off the drivable area", "Drive and rules", "lower", "proportion",
         formula="off_road > 0.",
-        headline=Headline(7, "episodes off the road", **_PERCENT),
+        headline=Headline(8, "episodes off the road", **_PERCENT),
         of="off_road",
     ),
     Description(
         "ran_red_light", "1 if the ego crossed a stop line on red", "Drive and rules", "lower", "proportion",
         formula="red_lights > 0.",
-        headline=Headline(8, "episodes with a red light run", **_PERCENT),
+        headline=Headline(9, "episodes with a red light run", **_PERCENT),
         of="red_lights",
     ),
     Description(
         "crashes_per_1000_km", "episodes with a contact, per 1,000 km that the ego drove", "Safety", "lower",
         "rate",
         formula="Episodes with contacts > 0 / sum of distance.",
-        headline=Headline(5, "crashes per 1,000 km"),
+        headline=Headline(6, "crashes per 1,000 km"),
         of="contacts",
     ),
     Description(

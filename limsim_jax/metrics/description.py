@@ -34,6 +34,7 @@ class Headline(NamedTuple):
     unit: str = ""
     scale: float = 1.0
     plain: bool = False  # only in the list of plain traffic, which has no ego
+    rare: bool = False  # only where it happened
 
 
 class Plot(NamedTuple):

@@ -19,6 +19,7 @@ from limsim_jax.metrics.measure import Derived, Measure, Metric, Own, Summary
 from limsim_jax.metrics.measures import built_in
 from limsim_jax.metrics.measures.comfort import Comfort
 from limsim_jax.metrics.measures.contacts import Contacts
+from limsim_jax.metrics.measures.progress import Progress
 from limsim_jax.metrics.motion import motion_flush, motion_result
 from limsim_jax.metrics.reductions import Measured
 from limsim_jax.metrics.safety import Rss
@@ -42,6 +43,7 @@ class EgoCarry(NamedTuple):
     start: Float[Array, ""]  # s
     now: Float[Array, ""]
     arrived: Bool[Array, ""]
+    broken: Bool[Array, ""]  # its policy has failed
     memory: dict[str, Any]  # of each measure, by its name
     own: tuple[Any, ...]  # of each metric of one's own
 
@@ -74,21 +76,32 @@ class EgoMetrics:
             start=zero,
             now=zero,
             arrived=no,
+            broken=no,
             memory={name: measure.init(vehicles, zones) for name, measure in self.measures.items()},
             own=tuple(Own(metric).init(vehicles, zones) for metric in self.own),
         )
 
     @jax.named_scope("ego_metrics")
     def update(self, carry: EgoCarry, step: EgoStep, lane_map: LaneMap | None = None) -> EgoCarry:
-        """One step. Nothing changes before the ego is active, nor after it arrived or left."""
-        there = step.active[step.slot] & ~carry.over
+        """One step. Nothing changes before the ego is active, nor after it arrived, left or failed.
+
+        Of the step in which it arrives and leaves only time and distance count, of that in which its policy
+        fails only the time.
+        """
+        there = step.active[step.slot] & ~carry.over & ~step.broken
         new = self._update(carry, step, lane_map)
         new = jax.tree.map(lambda a, b: jnp.where(there, a, b), new, carry)
-        arrives = new.started & ~carry.over & step.arrived
+        goes_on = new.started & ~carry.over & (step.active[step.slot] | step.arrived)
+        breaks, arrives = goes_on & step.broken, goes_on & step.arrived & ~step.broken
+        way = Progress().advance(new.memory[Progress.name], step.to_go, step.moved)
+        leaves = arrives & ~there
+        way = jax.tree.map(lambda a, b: jnp.where(leaves, a, b), way, new.memory[Progress.name])
         return new._replace(
             arrived=carry.arrived | arrives,
+            broken=carry.broken | breaks,
             over=carry.over | arrives | (carry.started & ~there),
-            now=jnp.where(arrives, step.t, new.now),
+            now=jnp.where(leaves | breaks, step.t, new.now),
+            memory=new.memory | {Progress.name: way},
         )
 
     def view(self, carry: EgoCarry, step: EgoStep, lane_map: LaneMap | None = None) -> StepView:
@@ -112,6 +125,7 @@ class EgoMetrics:
             start=jnp.where(carry.started, carry.start, step.t),
             now=step.t,
             arrived=carry.arrived,
+            broken=carry.broken,
             memory={name: measure.update(memory[name], view, derived) for name, measure in measures},
             own=tuple(
                 Own(metric).update(kept, view, derived)
@@ -143,11 +157,17 @@ class EgoMetrics:
         duration = carry.now - carry.start
         gained = progress.to_go[0] - progress.to_go[1]
         completion = jnp.clip(safe_divide(gained, progress.to_go[0], 1.0), 0, 1)
+        failed = carry.broken | (contacts.contacts > 0) | road.left_road.found
         return Summary(
             started=carry.started,
             arrived=carry.arrived,
+            there=carry.started & ~carry.over,
+            broken=carry.broken,
+            failed=failed,
+            now=carry.now,
             duration=duration,
             driven=carry.started & (duration > 0),
+            judged=carry.started & (failed | (duration > 0)),
             progress=gained,
             route=progress.to_go[0],
             completion=jnp.where(carry.arrived, 1, completion),

@@ -99,8 +99,13 @@ class Summary(NamedTuple):
 
     started: Bool[Array, ""]  # the ego was on the road
     arrived: Bool[Array, ""]
+    there: Bool[Array, ""]  # it is still on the road
+    broken: Bool[Array, ""]  # its policy has failed
+    failed: Bool[Array, ""]  # that, or a contact, or it left the road
+    now: Float[Array, ""]  # s, time of its last step
     duration: Float[Array, ""]  # s
     driven: Bool[Array, ""]  # it lasted at least a step
+    judged: Bool[Array, ""]  # that, or the ego failed at its start: scores have a value
     progress: Float[Array, ""]  # m nearer to the goal
     route: Float[Array, ""]  # m from the start to the goal
     completion: Float[Array, ""]  # 0 to 1

@@ -20,6 +20,7 @@ class Moment(NamedTuple):
 
 KINDS: Mapping[str, Moment] = MappingProxyType(
     {
+        "policy_failed": Moment("policy failed"),
         "contact": Moment("contact", "delta-v {:.1f} m/s"),
         "off_road": Moment("off the road"),
         "red_light": Moment("red light run"),

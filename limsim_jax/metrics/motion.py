@@ -12,8 +12,10 @@ that a ramp of the acceleration has a jerk an eighth too high near both ends.
 
 All of these are linear, so that each is a fixed row of weights on the last samples. At both ends of an
 episode SciPy's `mode="interp"` evaluates the polynomial of the outermost window; `head` and `tail` hold
-those weights, so that the stream gives what `scipy.signal.savgol_filter` gives on the whole record. An
-episode shorter than a filter has no value. Other time steps keep the length of the windows in seconds.
+those weights, so that the stream gives what `scipy.signal.savgol_filter` gives on the whole record. Of a
+record that a filter looks beyond, one polynomial of the same order is fitted to all samples (`fitted`), as
+nuPlan does with records shorter than a window: an episode that fails early has its values, too. Other time
+steps keep the length of the windows in seconds.
 
 Units: m/s^2, m/s^3, rad/s, rad/s^2. Lateral acceleration is speed times yaw rate, left > 0.
 """
@@ -22,7 +24,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +33,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.metrics.reductions import Least, Mean, Measured, measured
-from limsim_jax.numerics import masked_sum, safe_norm, safe_sqrt
+from limsim_jax.numerics import masked_sum, safe_divide, safe_norm, safe_sqrt
 from limsim_jax.standards import COMFORT
 
 Floats = NDArray[np.float64]
@@ -45,6 +47,12 @@ class Filter(NamedTuple):
     the middle of an episode."""
     tail: Floats
     """[M-1-H, M], from the last M samples to the values at those after the last filtered one."""
+    order: int
+    """Of the polynomial."""
+    derivative: int
+    """Of it."""
+    dt: float
+    """s between samples."""
 
     @property
     def window(self) -> int:
@@ -52,11 +60,14 @@ class Filter(NamedTuple):
         return self.head.shape[1]
 
 
-def stream(filter_all: Callable[[Floats], Floats], longest: int) -> Filter:
+def stream(
+    filter_all: Callable[[Floats], Floats], longest: int, order: int, derivative: int, dt: float
+) -> Filter:
     """The weights of a linear filter that is given as a function.
 
     The function filters a whole record, samples along axis 0; no output may look further than `longest` of
-    them. The weights are found by filtering unit impulses.
+    them. The weights are found by filtering unit impulses. Order, derivative and time step are those of the
+    polynomial for short records.
 
     Raises `ValueError` if outputs at the ends of a record look further than those in its middle.
     """
@@ -77,7 +88,7 @@ def stream(filter_all: Callable[[Floats], Floats], longest: int) -> Filter:
     m = h + 1 + after
     if a[: h + 1, m:].any() or a[n - after :, : n - m].any():
         raise ValueError("the edges of the filter look further than its middle")
-    return Filter(head=a[: h + 1, :m], tail=a[n - after :, n - m :])
+    return Filter(a[: h + 1, :m], a[n - after :, n - m :], order, derivative, dt)
 
 
 class FilterCarry(NamedTuple):
@@ -105,9 +116,42 @@ def filter_update(
 
 
 def filter_result(filter: Filter, carry: FilterCarry) -> tuple[Float[Array, "R C"], Bool[Array, " R"]]:
-    """The values known only at the end of a record, with validity."""
-    valid = jnp.broadcast_to(carry.taken >= filter.window, filter.tail.shape[:1])
-    return _apply(filter.tail, carry.samples), valid
+    """The values known only at the end of a record, with validity; all of them in a short record."""
+    m, rest = filter.window, filter.tail.shape[0]
+    short = carry.taken < m
+    known: Any = jnp.where(short, carry.taken, rest)
+    whole = _apply(np.concatenate([np.zeros((m - rest, m)), filter.tail]), carry.samples)
+    found = jnp.where(short, fitted(filter, carry), whole)
+    return found, jnp.arange(m) >= m - known
+
+
+def fitted(filter: Filter, carry: FilterCarry) -> Float[Array, "M C"]:
+    """Values of one polynomial fitted to all samples so far, fewer than `M`, or of its derivative.
+
+    Least squares in Gram's polynomials, which are orthogonal on evenly spaced points (Abramowitz and Stegun,
+    22.17). The norms of those whose order the samples do not bear are 0.
+    """
+    m, n = filter.window, carry.taken.astype(carry.samples.dtype)
+    place = jnp.arange(m, dtype=n.dtype) - (m - n)
+    there = (place >= 0)[:, None]
+    t, one, square = (place - (n - 1) / 2)[:, None], jnp.ones((m, 1)), n * n
+    bend = (3 * square - 7) / 20
+    gram = (  # each with its first two derivatives
+        (one, 0 * one, 0 * one),
+        (t, one, 0 * one),
+        (t * t - (square - 1) / 12, 2 * t, 2 * one),
+        (t * t * t - bend * t, 3 * t * t - bend, 6 * t),
+    )
+    norms = [n]
+    for k, scale in zip((1, 2, 3), (12, 15, 140 / 9), strict=True):
+        norms.append(norms[-1] * (square - k * k) / scale)
+    level = carry.samples[-1:]
+    samples = jnp.where(there, carry.samples - level, 0)  # what is common to all does not cost digits
+    found = level * one if filter.derivative == 0 else 0 * level * one
+    for polynomial, norm in list(zip(gram, norms, strict=True))[: filter.order + 1]:
+        share = safe_divide(jnp.sum(samples * jnp.where(there, polynomial[0], 0), 0, keepdims=True), norm)
+        found += share * polynomial[filter.derivative]
+    return found / filter.dt**filter.derivative
 
 
 def _apply(weights: Floats, samples: Float[Array, "M C"]) -> Float[Array, "K C"]:
@@ -140,10 +184,10 @@ def filters(dt: float) -> Filters:
 
     smooth = functools.partial(savgol, samples=8, order=2, derivative=0)
     return Filters(
-        acceleration=stream(smooth, window(8, 2)),
-        jerk=stream(lambda x: savgol(smooth(x), 15, 2, 1), window(15, 2) + window(8, 2)),
-        yaw_rate=stream(lambda x: savgol(x, 5, 2, 1), window(5, 2)),
-        yaw_acceleration=stream(lambda x: savgol(x, 5, 3, 2), window(5, 3)),
+        acceleration=stream(smooth, window(8, 2), 2, 0, dt),
+        jerk=stream(lambda x: savgol(smooth(x), 15, 2, 1), window(15, 2) + window(8, 2), 2, 1, dt),
+        yaw_rate=stream(lambda x: savgol(x, 5, 2, 1), window(5, 2), 2, 1, dt),
+        yaw_acceleration=stream(lambda x: savgol(x, 5, 3, 2), window(5, 3), 3, 2, dt),
     )
 
 
@@ -261,8 +305,8 @@ def _reduce(
         (turns[:, 0], new_y),
         (rates[:, 0], new_r),
     )
-    low = jnp.stack([jnp.min(jnp.where(new, x, jnp.inf)) for x, new in columns])
-    high = jnp.stack([jnp.max(jnp.where(new, x, -jnp.inf)) for x, new in columns])
+    low = jnp.stack([jnp.min(jnp.where(new, x, jnp.inf), initial=jnp.inf) for x, new in columns])
+    high = jnp.stack([jnp.max(jnp.where(new, x, -jnp.inf), initial=-jnp.inf) for x, new in columns])
     found = jnp.stack([new.any() for _, new in columns])
     now = jnp.broadcast_to(t, low.shape)
 

@@ -53,6 +53,7 @@ class StepRecord(NamedTuple):
     other: Int[Array, " N"]  # the second lane of a vehicle that changes lanes
     way: Int[Array, "N D"]  # lanes to come
     stopped: Bool[Array, "*e"]  # the ego has stopped at the stop sign ahead
+    goal: Int[Array, "*e"]  # of the ego now
 
 
 class EgoState(NamedTuple):
@@ -118,18 +119,18 @@ class EvaluateEgo:
         first = self._record(lane_map, at_start(config, state))
         vehicles = jnp.ones(state.lane.shape[0], bool)
 
-        def begin(step: EgoStep, stopped: Bool[Array, ""]) -> EgoState:
+        def begin(step: EgoStep, stopped: Bool[Array, ""], goal: Int[Array, ""]) -> EgoState:
             carry = EgoState(
                 metrics=self._begin(config, lane_map, step),
-                goal=state.goal[step.slot],
+                goal=goal,
                 lane=state.lane[step.slot],
                 stopped=jnp.zeros((), bool),
                 to_go=jnp.float32(0),
             )
-            return self._advance(config, lane_map, carry, step, stopped, first.traffic, vehicles)
+            return self._advance(config, lane_map, carry, step, stopped, goal, first.traffic, vehicles)
 
         _, traffic = self._metrics(config)
-        ego = self._each(begin, (_PER_EGO, 0))(first.ego, first.stopped)
+        ego = self._each(begin, (_PER_EGO, 0, 0))(first.ego, first.stopped, first.goal)
         slots = state.lane.shape[0]
         return MetricState(ego, _flow(traffic, traffic.init(slots, 0), first.traffic))
 
@@ -153,8 +154,8 @@ class EvaluateEgo:
         _, traffic = self._metrics(config)
 
         def one(carry: MetricState, record: StepRecord) -> tuple[MetricState, None]:
-            each = self._each(partial(self._advance, config, lane_map), (0, _PER_EGO, 0, None, 0))
-            ego = each(carry.ego, record.ego, record.stopped, record.traffic, relevant)
+            each = self._each(partial(self._advance, config, lane_map), (0, _PER_EGO, 0, 0, None, 0))
+            ego = each(carry.ego, record.ego, record.stopped, record.goal, record.traffic, relevant)
             return MetricState(ego, _flow(traffic, carry.traffic, record.traffic)), None
 
         return lax.scan(one, carry, records)[0]
@@ -184,17 +185,18 @@ class EvaluateEgo:
     def _record(self, lane_map: LaneMap, snapshot: Snapshot) -> StepRecord:
         state, keep = snapshot.state, bool(self.metrics)
 
-        def one(row: int | Int[Array, ""]) -> tuple[EgoStep, Bool[Array, ""]]:
+        def one(row: int | Int[Array, ""]) -> tuple[EgoStep, Bool[Array, ""], Int[Array, ""]]:
             step = ego_step(lane_map, snapshot, row, keep_state=keep)
-            return step, state.stopped[step.slot]
+            return step, state.stopped[step.slot], state.goal[step.slot]
 
-        step, stopped = self._each(one, (0,), (_PER_EGO, 0))(self._rows)
+        step, stopped, goal = self._each(one, (0,), (_PER_EGO, 0, 0))(self._rows)
         return StepRecord(
             ego=step,
             traffic=traffic_step(state, snapshot.left, snapshot.time, snapshot.dx),
             other=other_lane(lane_map, state)[0],
             way=state.lane[:, None],
             stopped=stopped,
+            goal=goal,
         )
 
     def _begin(self, config: Config, lane_map: LaneMap, step: EgoStep) -> EgoCarry:
@@ -211,6 +213,7 @@ class EvaluateEgo:
         carry: EgoState,
         step: EgoStep,
         stopped: Bool[Array, ""],
+        goal: Int[Array, ""],
         flow: TrafficStep,
         relevant: Bool[Array, " N"],
     ) -> EgoState:
@@ -218,8 +221,8 @@ class EvaluateEgo:
         ego, _ = self._metrics(config)
         routes, slot = lane_map.routes, step.slot
         lane, s = flow.lane[slot], flow.s[slot]
-        # an ego that leaves the map is on no lane any more
-        leaves = flow.left[slot] & routes.is_goal[carry.lane, carry.goal]
+        # an ego that leaves is on no lane any more
+        leaves = flow.left[slot] & ((goal == carry.goal) | routes.is_goal[carry.lane, carry.goal])
         on_route = routes.reachable[lane, carry.goal]
         reached = step.arrived & routes.is_goal[lane, carry.goal]
         to_go = jnp.where(on_route, routes.distance[lane, carry.goal] - s, carry.to_go)

@@ -123,6 +123,8 @@ def ego_step(
         to_go=jnp.float32(0),
         on_route=lane != NO_LANE,
         arrived=arrived(lane_map, state)[ego],
+        moved=snapshot.dx[slot],
+        broken=(state.status[slot] & int(Status.NOT_FINITE)) != 0,
         off_road=snapshot.off_road[slot],
         in_junction=lane_map.junction[at] >= 0,
         red_light=signals.red_light,

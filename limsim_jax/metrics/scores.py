@@ -74,6 +74,12 @@ CARLA_PENALTIES = {
 }
 """Coefficient of each infraction in the CARLA leaderboard 2.0."""
 
+CARLA_RADIUS = 5.0
+"""m: contacts nearer than this to the place of the last one are the same collision."""
+
+CARLA_STANDS = 0.1
+"""m/s: an ego that is slower is hit, and does not collide."""
+
 CARLA_MIN_SPEED = 0.70
 """Coefficient for no speed at all against that of the traffic; in proportion between."""
 

@@ -47,6 +47,8 @@ class EgoStep(NamedTuple):
     to_go: Float[Array, ""]  # m along the route to the goal
     on_route: Bool[Array, ""]  # on a lane of the route
     arrived: Bool[Array, ""]  # reached the goal in this step, whether or not it is still active
+    moved: Float[Array, ""]  # m travelled in this step, also in that of arrival
+    broken: Bool[Array, ""]  # its policy, or the policy's commands, have failed
     off_road: Bool[Array, ""]  # a corner is more than 0.3 m off the drivable area
     in_junction: Bool[Array, ""]
     red_light: Bool[Array, ""]  # crossed a stop line on red in this step

@@ -73,24 +73,24 @@ DESCRIPTIONS = (
     _column(
         "mean_speed", "m/s, distance travelled by time spent", "higher", "Distance travelled / time spent.",
         "No vehicle was there.", source=_EDIE, plot=Plot("Mean speed of the traffic", "m/s"),
-        headline=Headline(15, "mean speed", unit="m/s", plain=True),
+        headline=Headline(16, "mean speed", unit="m/s", plain=True),
     ),
     _column(
         "flow_per_hour", "vehicles per hour and lane", "higher",
         "Distance travelled / (length of all lanes x time), per hour.", source=_EDIE,
-        headline=Headline(16, "flow per lane", unit="vehicles/h", plain=True),
+        headline=Headline(17, "flow per lane", unit="vehicles/h", plain=True),
     ),
     _column(
         "density_per_km", "vehicles per km of lane", "neither",
         "Time spent / (length of all lanes x time), per km.", source=_EDIE,
-        headline=Headline(17, "density per lane", unit="vehicles/km", plain=True),
+        headline=Headline(18, "density per lane", unit="vehicles/km", plain=True),
     ),
     _column("vehicle_km", "km driven by all", "neither", "Distance travelled by all vehicles, in km."),
     _column(
         "delay_per_km", "s lost to others per km", "lower",
         "Time spent less that of the same distance at free speed, per km; free speed is the lesser of limit "
         "and desired speed.",
-        _STOOD, headline=Headline(18, "delay", unit="s/km", plain=True),
+        _STOOD, headline=Headline(19, "delay", unit="s/km", plain=True),
     ),
     _column(
         "delay_share", "share of the time lost to others", "lower", "That delay / time spent.",
@@ -109,7 +109,7 @@ DESCRIPTIONS = (
     _column("trips", "vehicles that reached their goals", "neither", "Vehicles that left at their goals."),
     _column(
         "mean_travel_time", "s, of those", "lower", "Mean time from entering to leaving, of trips.", _NO_TRIP,
-        headline=Headline(19, "travel time of a trip", unit="s", plain=True),
+        headline=Headline(20, "travel time of a trip", unit="s", plain=True),
     ),
     _column(
         "sd_travel_time", "s, standard deviation", "neither",

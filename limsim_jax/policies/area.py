@@ -19,8 +19,8 @@ from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.base import Policy, PolicyLike, renew_rows, variants
 from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.predict import Predictor
+from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Egos, Trajectory, assign
-from limsim_jax.traffic.engine import Command
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, State, Status
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Key
 
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.predict import Predictor
-from limsim_jax.traffic.engine import Command
+from limsim_jax.traffic.command import Command
 from limsim_jax.types import Config, State
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
@@ -254,7 +254,7 @@ def renew_rows(policy: Any, fresh: Bool[Array, " E"], new: Any, old: Any) -> Any
     return jax.tree.map(one, memory_rows(policy, new), new, old)
 
 
-def check_policy(policy: Any, config: Config, lane_map: LaneMap, state: State) -> None:
+def check_policy(policy: Any, config: Config, lane_map: LaneMap, state: State) -> tuple[Any, Any]:
     """Whether a policy keeps to the rules, found by tracing it once; nothing is compiled or run.
 
     Exceptions of the policy itself pass unchanged.
@@ -264,6 +264,9 @@ def check_policy(policy: Any, config: Config, lane_map: LaneMap, state: State) -
       config: of the experiment.
       lane_map: arrays, or their shapes (`jax.ShapeDtypeStruct`).
       state: of one world, with the rows of `egos` that the policy drives.
+
+    Returns:
+      The jaxprs of `init` and of a decision.
 
     Raises:
       ValueError: one line that names the class of the policy, what it returned and what is expected.
@@ -289,8 +292,9 @@ def check_policy(policy: Any, config: Config, lane_map: LaneMap, state: State) -
         _check_arrays(label, "the policy", found[1])
         return found
 
-    memory = jax.eval_shape(begin, lane_map, state)
-    command, after = jax.eval_shape(decide, lane_map, state, memory, jax.random.key(0))
+    first, memory = jax.make_jaxpr(begin, return_shape=True)(lane_map, state)
+    each, found = jax.make_jaxpr(decide, return_shape=True)(lane_map, state, memory, jax.random.key(0))
+    command, after = found
     before, now = (jax.tree_util.tree_flatten_with_path(x) for x in (memory, after))
     if before[1] != now[1]:
         raise ValueError(f"{label}: memory changes its structure, from {before[1]} to {now[1]}")
@@ -299,6 +303,7 @@ def check_policy(policy: Any, config: Config, lane_map: LaneMap, state: State) -
             place = jax.tree_util.keystr(path)
             raise ValueError(f"{label}: memory{place} changes from {_shape(old)} to {_shape(new)}")
     _check_command(label, command, state.egos.slot.shape[0])
+    return first, each
 
 
 def _check_command(label: str, command: Command, count: int) -> None:

@@ -28,7 +28,7 @@ from __future__ import annotations
 import sysconfig
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -43,11 +43,14 @@ from limsim_jax.maps.signals import lane_states
 from limsim_jax.policies.base import Policy, snake_case
 from limsim_jax.policies.predict import constant_velocity, nearest
 from limsim_jax.policies.reference import reference_path
+from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Control, Trajectory
-from limsim_jax.traffic.engine import Command
-from limsim_jax.types import Config, State
+from limsim_jax.types import Config, State, Status
 
 Kind = Literal["control", "trajectory", "meta"]
+
+BROKEN = -2
+"""A meta-action of a planner that failed: the engine takes it for a broken command."""
 
 # where installed code lies, which is not the planner's
 _FOREIGN = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
@@ -231,8 +234,10 @@ class HostPolicy(Policy):
     returns the mapping and the new array.
 
     Before anything is compiled, the function is tried on one empty straight road. An error there is a
-    `ValueError` of one line; an exception of the function is named with its file and line. Later errors, such
-    as a number that is not finite, end the run with a line of the same kind.
+    `ValueError` of one line; an exception of the function is named with its file and line. A world in which
+    the function fails later is a failed episode (`policy_failed`): it raises, returns something else than it
+    should, or a number that is not finite. After an exception the worlds of the call are tried one by one, so
+    that the others go on.
 
     Attributes:
       function: the planner.
@@ -241,6 +246,7 @@ class HostPolicy(Policy):
       observe: makes a pytree of arrays of one world: `(config, lane_map, state)`.
       samples: of a trajectory.
       dt: s between samples.
+      failures: why it failed in this process, by the random key of the decision.
     """
 
     function: Callable[..., Any]
@@ -249,6 +255,7 @@ class HostPolicy(Policy):
     observe: Callable[[Config, LaneMap, State], Any] = field(default_factory=Observe)
     samples: int = 41
     dt: float = 0.1
+    failures: dict[bytes, str] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.command not in get_args(Kind):
@@ -279,34 +286,35 @@ class HostPolicy(Policy):
         count = state.egos.slot.shape[0]
         seen = jax.eval_shape(lambda lane_map, state: self.observe(config, lane_map, state), lane_map, state)
         none = np.zeros((1, count, self.memory), np.float32)
-        self._call(_empty_road(seen), none, 1, count, finite=False)
+        self._call(_empty_road(seen), none, 1, count)
         return jnp.zeros((count, self.memory), jnp.float32)
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
     ) -> tuple[Command, Any]:
         """Call the function."""
-        del key
         seen = self.observe(config, lane_map, state)
         count = state.egos.slot.shape[0]
         shapes = {name: (count, *rest) for name, rest in self._fields().items()}
 
-        def ask(one: Any, seen: Any, memory: Any) -> Any:
+        status = state.status[state.egos.slot]
+        fine = state.active[state.egos.slot] & ((status & int(Status.NOT_FINITE)) == 0)
+
+        def ask(one: Any, *asked: Any) -> Any:
             # the leading axes of `one` are those that `vmap` has added
             batch = np.shape(one)
             size = int(np.prod(batch))
-            flat = jax.tree.map(
-                lambda x: np.asarray(x).reshape(size, *np.shape(x)[len(batch) :]), (seen, memory)
-            )
-            found, kept = self._call(flat[0], flat[1], size, count)
+            flat = jax.tree.map(lambda x: np.asarray(x).reshape(size, *np.shape(x)[len(batch) :]), asked)
+            found, kept = self._ask(_Asked(*flat), count)
             return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), (found, kept))
 
         kind = jnp.int32 if self.command == "meta" else jnp.float32
         wanted = {name: jax.ShapeDtypeStruct(shape, kind) for name, shape in shapes.items()}
         kept = jax.ShapeDtypeStruct(memory.shape, jnp.float32)
         found, memory = jax.pure_callback(
-            ask, (wanted, kept), jnp.zeros(()), seen, memory, vmap_method="broadcast_all"
-        )
+            ask, (wanted, kept), jnp.zeros(()), *_Asked(seen, memory, fine, jax.random.key_data(key)),
+            vmap_method="broadcast_all",
+        )  # fmt: skip
         return command_from(self.command, found, config, state, self.dt), memory
 
     def _fields(self) -> dict[str, tuple[int, ...]]:
@@ -317,8 +325,45 @@ class HostPolicy(Policy):
             return {"meta": ()}
         return {name: (self.samples,) for name in ("x", "y", "heading", "v")}
 
+    def _ask(self, asked: _Asked, count: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """What the function says of all worlds; worlds in which it fails get broken commands.
+
+        Worlds in which it has failed before are not shown to it again: they look like one of the others.
+        """
+        size = len(asked.key)
+        alive = np.flatnonzero(asked.fine.any(-1))
+        if alive.size and alive.size < size:
+            shown = np.where(np.isin(np.arange(size), alive), np.arange(size), alive[0])
+        else:
+            shown = np.arange(size)
+        seen, memory = jax.tree.map(lambda x: x[shown], (asked.seen, asked.memory))
+        found, kept = self._nothing(size, count), np.array(asked.memory)
+        if not alive.size:
+            return found, kept
+        try:
+            answer, remembered = self._call(seen, memory, size, count)
+            for name, x in answer.items():
+                found[name][alive] = x[alive]
+            kept[alive] = remembered[alive]
+        except ValueError:
+            for k in map(int, alive):
+                try:
+                    seen, memory = jax.tree.map(lambda x: x[k : k + 1], (asked.seen, asked.memory))  # noqa: B023
+                    answer, kept[k : k + 1] = self._call(seen, memory, 1, count)
+                except ValueError as error:
+                    self.failures[asked.key[k].tobytes()] = str(error)
+                    continue
+                for name, x in answer.items():
+                    found[name][k : k + 1] = x
+        return found, kept
+
+    def _nothing(self, size: int, count: int) -> dict[str, np.ndarray]:
+        """Broken commands."""
+        kind, value = (np.int32, BROKEN) if self.command == "meta" else (np.float32, np.nan)
+        return {name: np.full((size, count, *rest), value, kind) for name, rest in self._fields().items()}
+
     def _call(
-        self, seen: Any, memory: Any, size: int, count: int, finite: bool = True
+        self, seen: Any, memory: Any, size: int, count: int
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Call the function for `size` worlds and check what it returns."""
         name = getattr(self.function, "__qualname__", type(self.function).__qualname__)
@@ -335,9 +380,29 @@ class HostPolicy(Policy):
         kind = np.int32 if self.command == "meta" else np.float32
         checked: dict[str, np.ndarray] = {}
         for field_, rest in self._fields().items():
-            checked[field_] = _checked(name, field_, found[field_], (size, count, *rest), kind, finite)
+            checked[field_] = _checked(name, field_, found[field_], (size, count, *rest), kind)
         shape = (size, count, self.memory)
-        return checked, _checked(name, "memory", memory, shape, np.float32, finite)
+        return checked, _checked(name, "memory", memory, shape, np.float32)
+
+
+class _Asked(NamedTuple):
+    """What a call is about, `[B, ...]`."""
+
+    seen: Any
+    memory: Any
+    fine: Any  # [B, E], the ego is there and the planner has not failed it
+    key: Any  # of the decision
+
+
+def failure_reasons(policy: Any) -> dict[bytes, str]:
+    """Why planners within a policy failed in this process, by the random key of the decision."""
+    found: dict[bytes, str] = {}
+    if isinstance(policy, HostPolicy):
+        found |= policy.failures
+    for value in vars(policy).values() if is_dataclass(policy) else ():
+        if is_dataclass(value) and not isinstance(value, type):
+            found |= failure_reasons(value)
+    return found
 
 
 def _where(error: Exception, name: str) -> str:
@@ -358,9 +423,7 @@ def _what(found: Any) -> str:
     )
 
 
-def _checked(
-    name: str, field_: str, value: Any, shape: tuple[int, ...], kind: Any, finite: bool
-) -> np.ndarray:
+def _checked(name: str, field_: str, value: Any, shape: tuple[int, ...], kind: Any) -> np.ndarray:
     """The value as an array of this shape; otherwise a `ValueError`."""
     try:
         array = np.asarray(value)
@@ -372,8 +435,4 @@ def _checked(
         raise ValueError(f"{name}: {field_} is {_what(value)} of {array.dtype}, not an array of {wanted}")
     if array.shape != shape:
         raise ValueError(f"{name}: {field_} has shape {list(array.shape)}, not [B, E, ...] = {list(shape)}")
-    if finite and not np.isfinite(array).all():
-        world, ego = np.argwhere(~np.isfinite(array))[0][:2]
-        bad = array[~np.isfinite(array)][0]
-        raise ValueError(f"{name}: {field_} of ego {ego} in world {world} of the call is {bad}")
     return np.ascontiguousarray(array, kind)

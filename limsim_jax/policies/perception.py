@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.predict import Prediction
 from limsim_jax.policies.reference import ReferencePath, project_onto
+from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import at_slots
-from limsim_jax.traffic.engine import Command, Decision, Traffic, decide
+from limsim_jax.traffic.engine import Decision, Traffic, decide
 from limsim_jax.types import Config, State
 
 _NEXT_LANE = 5.0  # m off the path, within which a vehicle may be changing to it

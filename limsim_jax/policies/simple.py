@@ -12,8 +12,9 @@ from limsim_jax.maps.lane_map import LaneMap, pose
 from limsim_jax.policies.base import Policy
 from limsim_jax.policies.perception import rules
 from limsim_jax.policies.reference import center_lane, path_from
+from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Control, Trajectory
-from limsim_jax.traffic.engine import Command, Traffic
+from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import accelerations
 from limsim_jax.types import Config, State
 

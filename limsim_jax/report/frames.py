@@ -20,7 +20,7 @@ from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import lane_states_on_host
 from limsim_jax.report.draw import TRAFFIC_ZORDER, draw_network
 from limsim_jax.report.draw.painter import INK
-from limsim_jax.simulation.ending import ending, without_arrived
+from limsim_jax.simulation.ending import ending
 from limsim_jax.simulation.trace import Trace
 from limsim_jax.types import Status
 
@@ -119,8 +119,6 @@ class Scene:
         self.v, self.vehicle = trace.v, trace.vehicle
         self.active = np.asarray(trace.active, bool)
         self.ends = {ego: ending(trace, ego) for ego in egos}
-        for ego, end in self.ends.items():
-            self.active = self.active & without_arrived(trace, ego, end)
         self.plans_of = None if trace.driven is None else trace.driven  # [T, E], slots
         self.plan_xy = (
             None

@@ -50,7 +50,7 @@ class Captions:
             self.rows.append((float(row["time"]), text, slot))
         for end in scene.ends.values():
             if end is not None and end.arrived:
-                self.rows.append((float(scene.time[end.step]), "arrived", None))
+                self.rows.append((float(scene.time[end.step + 1]), "arrived", None))
         self.times = np.array([time for time, *_ in self.rows])
 
     def at(self, time: float) -> tuple[str, int | None]:

@@ -62,6 +62,7 @@ class Main(NamedTuple):
     unit: str = ""
     scale: float = 1.0
     plain: bool = False
+    rare: bool = False
 
 
 MAIN = tuple(Main(x.name, *x.headline[1:]) for x in headlines() if x.headline)
@@ -279,7 +280,9 @@ def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = 
         if any(cells):
             label = f"{main.label}, {main.unit}" if main.unit else main.label
             rows.append([label, *cells])
-    notes = [
+    notes = [_causes_note(group, part, several) for group, part in groups(results).items()]
+    notes = [note for note in notes if note]
+    notes += [
         f"Brackets: {100 * level:g} % intervals over seeds: Wilson for shares, BCa bootstrap for means, "
         "exact for rates and medians."
     ]
@@ -292,10 +295,26 @@ def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = 
     return TextTable(header, rows, notes)
 
 
+def _causes_note(group: Group, part: pa.Table, several: bool) -> str:
+    """How many episodes are without success, and why; empty where all have it."""
+    cause = causes(part)
+    total = int((cause != "").sum())
+    if not total:
+        return ""
+    counted = [(int((cause == name).sum()), words) for name, words in CAUSES.items()]
+    why = ", ".join(f"{n:,} {words}" for n, words in counted if n)
+    label = f"{group[0]} / {group[1]}" if several else group[0]
+    return f"{label}: {total:,} of {part.num_rows:,} without success: {why}."
+
+
 def short_list(found: Mapping[tuple[str, str, str], Any]) -> list[Main]:
-    """The main metrics of a summary; those of plain traffic only where there is no ego."""
+    """The main metrics of a summary.
+
+    Those of plain traffic only where there is no ego, and those that are rare only where they happened.
+    """
     plain = not any(metric == "success" for *_, metric in found)
-    return [main for main in MAIN if plain or not main.plain]
+    happened = {metric for (*_, metric), row in found.items() if row["maximum"]}
+    return [main for main in MAIN if (plain or not main.plain) and (main.metric in happened or not main.rare)]
 
 
 def lookup(table: pa.Table) -> dict[tuple[str, str, str], dict[str, Any]]:
@@ -321,6 +340,7 @@ _WORST_SCHEMA = pa.schema(
         ("seed", pa.int64()),
         ("ego", pa.int32()),
         ("metric", pa.float64()),
+        ("policy_failed", pa.bool_()),
         ("contact", pa.bool_()),
         ("at_fault", pa.bool_()),
         ("delta_v", pa.float64()),
@@ -335,6 +355,7 @@ _WORST_SCHEMA = pa.schema(
         ("module", pa.string()),
         ("avoidable_by_ego", pa.bool_()),
         ("avoidable_by_other", pa.bool_()),
+        ("reason", pa.string()),
     ]
 )
 
@@ -342,13 +363,14 @@ _WORST_SCHEMA = pa.schema(
 def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
     """The k worst episodes of all scenarios and policies, the worst first.
 
-    In this order: contacts at the ego's fault (by nuPlan's rules, or by responsibility, alone or shared),
-    other contacts, both by delta-v; episodes off the road; episodes without success; the rest by the least
-    TTC. With `metric`: by its value, without the episodes in which it was not measured.
+    In this order: episodes in which the policy failed; contacts at the ego's fault (by nuPlan's rules, or by
+    responsibility, alone or shared), other contacts, both by delta-v; episodes off the road; episodes without
+    success; the rest by the least TTC. With `metric`: by its value, without the episodes in which it was not
+    measured.
 
-    Columns: place, scenario, policy, seed, ego, metric (its value), contact, at_fault, delta_v (m/s), min_ttc
-    (s), left_road, failed (no success), and of the episode's worst moment kind, time (s), other (slot),
-    value, responsible, module, avoidable_by_ego, avoidable_by_other.
+    Columns: place, scenario, policy, seed, ego, metric (its value), policy_failed, contact, at_fault, delta_v
+    (m/s), min_ttc (s), left_road, failed (no success), and of the episode's worst moment kind, time (s),
+    other (slot), value, responsible, module, avoidable_by_ego, avoidable_by_other, reason.
 
     Raises `ValueError` for an unknown metric, or one of which neither more nor less is worse.
     """
@@ -366,7 +388,7 @@ def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
     ranked = None if metric is None else columns(table, [metric])[:, 0]
     if metric is None or ranked is None:
         order = np.lexsort((seeds, view["min_ttc"], -view["failed"], -view["left_road"], -view["delta_v"],
-                            -view["at_fault"], -view["contact"]))  # fmt: skip
+                            -view["at_fault"], -view["contact"], -view["policy_failed"]))  # fmt: skip
     else:
         order = np.lexsort((seeds, sign * ranked))
         order = order[~np.isnan(ranked[order])]
@@ -377,11 +399,12 @@ def worst(results: Results, metric: str | None = None, k: int = 10) -> pa.Table:
     for place, (i, row) in enumerate(zip(order, chosen, strict=True), 1):
         key = episode_key(row)
         row |= dict(place=place, metric=None if ranked is None else float(ranked[i]))
-        row |= {name: bool(view[name][i]) for name in ("contact", "at_fault", "left_road", "failed")}
+        flags = ("policy_failed", "contact", "at_fault", "left_road", "failed")
+        row |= {name: bool(view[name][i]) for name in flags}
         row["delta_v"] = float(view["delta_v"][i]) if row["contact"] else None
         row["min_ttc"] = float(view["min_ttc"][i]) if np.isfinite(view["min_ttc"][i]) else None
         moment = moments.get(key, {})
-        row |= {name: moment.get(name) for name in _WORST_SCHEMA.names[12:]}
+        row |= {name: moment.get(name) for name in _WORST_SCHEMA.names[13:]}
         if row["time"] is None:
             when = view["contact_time"][i] if row["contact"] else view["min_ttc_time"][i]
             row["time"] = null(float(when))
@@ -408,6 +431,7 @@ def _severity(table: pa.Table) -> dict[str, NDArray[Any]]:
     involved = np.isin(responsible, (int(Responsibility.EGO), int(Responsibility.SHARED)))
     contact = read("contacts", 0) > 0
     return {
+        "policy_failed": (read("policy_failed", 0) > 0) * 1.0,
         "contact": contact * 1.0,
         "at_fault": (contact & (involved | (read("at_fault_contacts", 0) > 0))) * 1.0,
         "delta_v": np.maximum(read("max_delta_v", 0), read("contact_delta_v", 0)) * contact,
@@ -418,6 +442,71 @@ def _severity(table: pa.Table) -> dict[str, NDArray[Any]]:
         "min_ttc_time": read("min_ttc_time", math.nan),
         "responsible": responsible,
     }
+
+
+CAUSES: Mapping[str, str] = {
+    "policy_failed": "the policy failed",
+    "at_fault": "contact at the ego's fault",
+    "contact": "other contact",
+    "left_road": "off the road",
+    "out_of_time": "out of time",
+    "elsewhere": "left elsewhere than at its goal",
+    "criteria": "arrived against the criteria of success",
+}
+"""Why an episode is without success, the first that holds, in words."""
+
+
+def causes(part: pa.Table) -> NDArray[Any]:
+    """The cause of each episode without success, of `CAUSES`; "" where there is success or it is unknown."""
+    severity = _severity(part)
+
+    def flag(name: str) -> NDArray[np.bool_]:
+        known = name in part.column_names
+        return columns(part, [name])[:, 0] > 0 if known else np.zeros(part.num_rows, bool)
+
+    found = {name: severity[name] > 0 for name in ("policy_failed", "at_fault", "contact", "left_road")}
+    found |= {"out_of_time": flag("out_of_time"), "elsewhere": ~flag("arrived"), "criteria": flag("arrived")}
+    cause = np.select(list(found.values()), list(found), "")
+    return np.where(severity["failed"] > 0, cause, "")
+
+
+class Failure(NamedTuple):
+    """A reason for which a policy failed."""
+
+    group: Group
+    reason: str
+    seeds: list[int]
+    episodes: int  # of the group
+
+    @property
+    def text(self) -> str:
+        """As one line."""
+        (scenario, policy), n = self.group, len(self.seeds)
+        some = ", ".join(map(str, self.seeds[:6])) + (", ..." if n > 6 else "")
+        return (
+            f"policy {policy} failed in {n:,} of {self.episodes:,} episodes of {scenario}: {self.reason} "
+            f"(seed{'s' if n > 1 else ''} {some})"
+        )
+
+
+def failed_policies(results: Results, parts: Mapping[Group, pa.Table] | None = None) -> list[Failure]:
+    """Episodes in which the policy failed, by reason, most of them first.
+
+    `parts`: the `groups` of the results, if they are known already.
+    """
+    rows = results.moments.filter(pc.field("kind") == "policy_failed").to_pylist()
+    if not rows:
+        return []
+    parts = groups(results) if parts is None else parts
+    found: dict[tuple[Group, str], list[int]] = {}
+    for row in rows:
+        key = (row["scenario"], row["policy"]), row["reason"] or ""
+        found.setdefault(key, []).append(row["seed"])
+    failures = [
+        Failure(group, reason, sorted(set(seeds)), parts[group].num_rows)
+        for (group, reason), seeds in found.items()
+    ]
+    return sorted(failures, key=lambda failure: -len(failure.seeds))
 
 
 EpisodeKey = tuple[str, str, int, int]

@@ -18,14 +18,14 @@ AFTER = 2.0
 class Ending(NamedTuple):
     """The last step of an ego, and how it ends."""
 
-    step: int  # the last one at which the ego is shown
-    arrived: bool
+    step: int  # the last one at which the ego is there
+    arrived: bool  # it leaves in the next step at its goal
 
 
 def ending(trace: Trace, ego: int) -> Ending | None:
     """The end of the first vehicle in a slot.
 
-    It has arrived at the first step at which it has 0 m to go; the simulation may drive it on from there.
+    It has arrived if it has 0 m to go in the step in which it is gone.
 
     Args:
       trace: `[T, ...]`.
@@ -43,18 +43,7 @@ def ending(trace: Trace, ego: int) -> Ending | None:
     last = first + (int(np.argmin(stays)) - 1 if not stays.all() else len(stays) - 1)
     if trace.to_go is None or trace.driven is None or np.asarray(trace.driven)[first, :1].tolist() != [ego]:
         return Ending(last, False)
-    goal = np.flatnonzero(np.asarray(trace.to_go)[first : last + 1] <= 0)
-    return Ending(first + int(goal[0]), True) if goal.size else Ending(last, False)
-
-
-def without_arrived(trace: Trace, ego: int, end: Ending | None) -> NDArray[np.bool_]:
-    """`active [T, N]` without the ego from the step after its arrival."""
-    active = np.array(trace.active, bool)
-    if end is not None and end.arrived:
-        vehicle = np.asarray(trace.vehicle)[:, ego]
-        after = np.arange(len(active)) > end.step
-        active[:, ego] &= ~(after & (vehicle == vehicle[end.step]))
-    return active
+    return Ending(last, bool((np.asarray(trace.to_go)[last + 1 : last + 2] <= 0).any()))
 
 
 def shown_steps(time: NDArray[Any], end: Ending | None, moments: NDArray[Any] | None = None) -> int:

@@ -186,6 +186,11 @@ def world_key(seed: int | Int[Array, ""]) -> Key[Array, ""]:
     return jax.random.fold_in(jax.random.key(0), seed)
 
 
+def decision_key(seed: int, step: int) -> Key[Array, ""]:
+    """The key with which a policy decides in the world of a seed after so many physics steps."""
+    return jax.random.fold_in(jax.random.split(world_key(seed))[1], step)
+
+
 Sampler = Callable[[Key[Array, ""]], Scenario]
 """Draws the scenario of a world from its key."""
 

@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float, Int
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.traffic.engine import Tick
 from limsim_jax.traffic.motion import boxes
-from limsim_jax.types import State
 
 
 class Trace(NamedTuple):
@@ -61,7 +60,7 @@ def trace(lane_map: LaneMap) -> Callable[[Tick], Trace]:
             phase=state.lights.phase,
             vehicle_class=state.shape.vehicle_class,
             driven=driven,
-            to_go=_to_go(lane_map, state) if some else None,
+            to_go=_to_go(lane_map, tick) if some else None,
             plan=plan,
             plan_time=plan_time,
         )
@@ -79,10 +78,15 @@ def _plan(tick: Tick, driven: Int[Array, " E"] | None) -> tuple[Array | None, Ar
     return plan, planned.t0 + planned.dt * jnp.arange(plan.shape[1], dtype=plan.dtype)
 
 
-def _to_go(lane_map: LaneMap, state: State) -> Float[Array, ""]:
-    """Metres from the first ego to the end of its goal; NaN: gone, or no way there."""
+def _to_go(lane_map: LaneMap, tick: Tick) -> Float[Array, ""]:
+    """Metres from the first ego to the end of its goal.
+
+    0 in the step in which it leaves there; NaN: gone, or no way there.
+    """
+    state = tick.state
     slot = state.egos.slot[0]
     lane = state.lane[slot]
     routes, goal = lane_map.routes, state.goal[slot]
     known = state.active[slot] & (lane != NO_LANE) & routes.reachable[lane, goal]
-    return jnp.where(known, jnp.maximum(routes.distance[lane, goal] - state.s[slot], 0), jnp.nan)
+    to_go = jnp.where(known, jnp.maximum(routes.distance[lane, goal] - state.s[slot], 0), jnp.nan)
+    return jnp.where(tick.left[slot], 0, to_go)

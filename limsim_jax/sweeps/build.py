@@ -5,21 +5,14 @@ What does not fit the map, or names something that is not there, is an `Experime
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
 import importlib
-import inspect
-import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
-from types import FunctionType
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from limsim_jax.maps import bundled_maps
 from limsim_jax.maps.lane_map import LaneMap, lane_rows
@@ -50,8 +43,6 @@ MODELS: dict[str, Callable[[], Any]] = {
     "acc": car_following.ACC,
 }
 """Car-following models by their names in experiment files."""
-
-_PACKAGE = Path(__file__).resolve().parents[1]
 
 ROADS_OF_A_CLOSED_MAP = 12
 """Roads, at most, on which traffic comes into a map without origins."""
@@ -282,59 +273,3 @@ def traffic_of(experiment: ExperimentFile, model: Any = None) -> Traffic:
         lane_changes=traffic.lane_changes,
         after_collision=traffic.after_collision,
     )
-
-
-def describe(value: Any) -> Any:
-    """A policy, a population, a model or metrics as JSON: what it is and of which numbers.
-
-    Arrays are hashed. A class that comes from a file outside installed packages brings the hash of that file,
-    so that rows of an edited policy are other rows.
-    """
-    if isinstance(value, str | int | float | bool | None):
-        return value
-    if isinstance(value, tuple | list):
-        return [describe(x) for x in value]
-    if isinstance(value, Mapping):
-        return {str(name): describe(x) for name, x in value.items()}
-    if isinstance(value, np.ndarray | jax.Array):
-        array = np.asarray(value)
-        return f"{array.dtype}{list(array.shape)} {hashlib.sha256(array.tobytes()).hexdigest()[:16]}"
-    kind = value if isinstance(value, type | FunctionType) else type(value)
-    found = {"is": f"{kind.__module__}.{kind.__qualname__}"}
-    if source := _own_source(kind):
-        found["source"] = source
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        found |= {x.name: describe(getattr(value, x.name)) for x in dataclasses.fields(value)}
-    elif not isinstance(value, type | FunctionType):
-        found |= {name: describe(x) for name, x in sorted(getattr(value, "__dict__", {}).items())}
-    return found
-
-
-def describe_program(*parts: Any) -> str | None:
-    """All that a compiled program depends on; None if code that is not ours takes part.
-
-    The source of the package and shapes of arguments are not included.
-    """
-    found = describe(parts)
-
-    def kinds(tree: Any) -> Iterator[str]:
-        if isinstance(tree, Mapping):
-            yield tree.get("is", "limsim_jax.")
-        for x in tree.values() if isinstance(tree, Mapping) else tree if isinstance(tree, list) else ():
-            yield from kinds(x)
-
-    foreign = any(not kind.startswith("limsim_jax.") or kind.endswith(".HostPolicy") for kind in kinds(found))
-    return None if foreign else json.dumps(found, sort_keys=True)
-
-
-def _own_source(kind: Any) -> str | None:
-    """Hash of the source file of a class or function.
-
-    None for what comes with an installed package."""
-    try:
-        path = Path(inspect.getsourcefile(kind) or "")
-        if not path.is_file() or path.is_relative_to(_PACKAGE) or "site-packages" in path.parts:
-            return None
-        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-    except (TypeError, OSError):  # built in, or typed into a notebook
-        return None

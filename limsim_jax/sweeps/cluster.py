@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from limsim_jax.sweeps.runner import Episodes, Progress, SweepSummary, sweep
+from limsim_jax.sweeps.runner import Episodes, OnError, Progress, SweepSummary, sweep
 from limsim_jax.sweeps.store import Entry, Outcome
 
 RETRIES = 3
@@ -37,12 +37,14 @@ def sweep_on_ray(
     shard: tuple[int, int] | None = None,
     until_ci: tuple[float, str] | None = None,
     progress: Callable[[Progress], None] | None = None,
+    on_error: OnError = "record",
+    fresh: bool = False,
 ) -> SweepSummary:
     """`runner.sweep` with Ray workers.
 
     Args:
       factory: makes the episodes on a worker; picklable. Must make the same everywhere.
-      seeds, out, shard, until_ci, progress: as of `runner.sweep`.
+      seeds, out, shard, until_ci, progress, on_error, fresh: as of `runner.sweep`.
       workers: how many; each runs a chunk at a time.
       address: of the cluster, as for `ray.init`; without one a cluster on this machine for this call.
         A Ray that is initialised already is used as it is.
@@ -66,6 +68,7 @@ def sweep_on_ray(
     pool = _Pool(factory, workers, {"num_cpus": 1, "max_restarts": 0, **(resources or {})})
     try:
         options: dict[str, Any] = {"shard": shard, "until_ci": until_ci, "progress": progress}
+        options |= {"on_error": on_error, "fresh": fresh}
         return sweep(pool.describe(), seeds, out, run_chunks=pool.run_chunks, **options)
     finally:
         pool.close()

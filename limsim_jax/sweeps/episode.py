@@ -28,15 +28,14 @@ from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos, EvaluateTraffic
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.policies.base import PolicyLike, check_policy, policy_name
+from limsim_jax.policies.host import failure_reasons
 from limsim_jax.simulation.ending import Watch
-from limsim_jax.simulation.rollout import Rollout
+from limsim_jax.simulation.rollout import Rollout, decision_key
 from limsim_jax.simulation.totals import Totals
 from limsim_jax.simulation.trace import trace
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweeps.build import (
     demand_of,
-    describe,
-    describe_program,
     egos_of,
     flows_of,
     map_of,
@@ -44,6 +43,7 @@ from limsim_jax.sweeps.build import (
     traffic_of,
 )
 from limsim_jax.sweeps.experiment import NO_POLICY, Bounds, ExperimentError, ExperimentFile
+from limsim_jax.sweeps.identity import describe, describe_program, is_foreign, policy_code
 from limsim_jax.sweeps.moments import key_moments
 from limsim_jax.sweeps.reruns import CanBrake, Replay, Reruns
 from limsim_jax.sweeps.store import Outcome
@@ -109,7 +109,7 @@ class Episodes:
         config = Config(dt=experiment.dt, decision_every=experiment.decision_every)
         behaviour = traffic_of(experiment, model)
         self.rollout = Rollout(config, behaviour, experiment.horizon, self._policy, measure=self._measure)
-        self._check_policy()
+        self._code = self._check_policy()
         self.world_bytes = self._memory()
         self.chunk = self._chunk() if chunk is None else chunk
         run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
@@ -192,10 +192,14 @@ class Episodes:
             needed = "one vehicle" if one else f"{self.egos} vehicles"
             self._refuse("traffic.density", f"{starts} at least {needed} at the start")
 
-    def _check_policy(self) -> None:
-        """Trace a policy of one's own once: what is wrong with it is one line, not a trace of a compiler."""
+    def _check_policy(self) -> dict[str, Any] | None:
+        """The code of a policy of one's own.
+
+        It is traced once: what is wrong with it is one line, not a trace of a compiler."""
+        if not is_foreign(self._policy):
+            return None
         if type(self._policy).__module__.startswith("limsim_jax."):
-            return
+            return policy_code(self._policy)
 
         def start(key: jax.Array) -> State:
             state = self.sample(key).start
@@ -203,9 +207,10 @@ class Episodes:
 
         state = jax.eval_shape(start, jax.random.key(0))
         try:
-            check_policy(self._policy, self.rollout.config, self.lane_map, state)
+            programs = check_policy(self._policy, self.rollout.config, self.lane_map, state)
         except ValueError as error:
             self._refuse("policy", str(error))
+        return policy_code(self._policy, programs)
 
     def sample(self, key: jax.Array) -> Scenario:
         """The scenario of a world."""
@@ -235,6 +240,7 @@ class Episodes:
         return {
             **({"drivers": file_hash(Path(drivers).read_bytes())} if drivers is not None else {}),
             **{name: describe(value) for name, value in self._values.items() if value},
+            **({"policy_code": self._code} if self._code else {}),
             "experiment": self.experiment.model_dump(mode="json", exclude={"map"}),
             "map": {"file": os.path.basename(self.network.source), "hash": self.network.file_hash},
             "map_file": self._map_file(),
@@ -277,7 +283,7 @@ class Episodes:
             seeds=rows,
             egos=egos,
             metrics=metrics,
-            moments=key_moments(rows, egos, metrics),
+            moments=key_moments(rows, egos, metrics, self._reasons(rows, metrics)),
             digest=_digest(metrics, result.state, each),
         )
 
@@ -290,8 +296,29 @@ class Episodes:
         each = max(self.egos, 1)
         metrics = {name: x.ravel() if x.ndim == 2 else np.repeat(x, each) for name, x in found.items()}
         if self.experiment.success:
-            metrics["success"] = _succeeds(metrics, self.experiment.success)
+            sound = metrics["policy_failed"] == 0 if "policy_failed" in metrics else True
+            metrics["success"] = _succeeds(metrics, self.experiment.success) * sound
         return {name: metrics[name] for name in self.units}
+
+    def _reasons(
+        self, seeds: NDArray[np.int64], metrics: Mapping[str, NDArray[np.float64]]
+    ) -> dict[int, str]:
+        """By seed, what exceptions of a planner on the host said."""
+        known = failure_reasons(self._policy)
+        if not known:
+            return {}
+        only = set(known.values()) if len(set(known.values())) == 1 else set()
+        found = {}
+        for k in np.flatnonzero(metrics["policy_failed"] > 0):
+            seed, step = (
+                int(seeds[k]),
+                round(float(metrics["policy_failed_time"][k]) / self.experiment.dt) - 1,
+            )
+            key = np.asarray(jax.random.key_data(decision_key(seed, step))).tobytes()
+            reason = known.get(key) or next(iter(only), None)
+            if reason:
+                found[seed] = reason
+        return found
 
     @cached_property
     def _reruns(self) -> Reruns:
@@ -332,7 +359,8 @@ class Episodes:
         for k, (seed, ego) in enumerate(which):
             row = k * max(self.egos, 1) + ego
             metrics = {name: x[row : row + 1] for name, x in columns.items()}
-            moments = key_moments(np.asarray([seed], np.int64), np.asarray([ego], np.int32), metrics)
+            seeds = np.asarray([seed], np.int64)
+            moments = key_moments(seeds, np.asarray([ego], np.int32), metrics, self._reasons(seeds, metrics))
             table = {name: column.tolist() for name, column in moments.items()}
             rows = [dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True)]
             seen = jax.tree.map(lambda x: x[k], result.trace)  # noqa: B023

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -30,11 +31,19 @@ _COLUMNS: dict[str, Any] = {
     "other": np.float64,
     "value": np.float64,
     "responsible": object,
+    "reason": object,
 }
 
 
+NOT_FINITE = "a command that is not finite"
+"""Reason of a policy that failed without an exception."""
+
+
 def key_moments(
-    seeds: NDArray[np.int64], egos: NDArray[np.int32], metrics: Mapping[str, NDArray[np.float64]]
+    seeds: NDArray[np.int64],
+    egos: NDArray[np.int32],
+    metrics: Mapping[str, NDArray[np.float64]],
+    reasons: Mapping[int, str] = MappingProxyType({}),
 ) -> dict[str, NDArray[Any]]:
     """Key moments of rows of metrics, the worst of each row first.
 
@@ -42,12 +51,14 @@ def key_moments(
       seeds: of the rows, `[R]`.
       egos: of the rows, `[R]`.
       metrics: columns, `[R]` each; rows without an ego have no key moments.
+      reasons: by seed, why a policy failed that raised an exception.
     """
     m = metrics
     if "contact_time" not in m:
         return {name: np.asarray([], kind) for name, kind in _COLUMNS.items()}
     nobody = np.full(len(seeds), np.nan)
     found = {
+        "policy_failed": (m["policy_failed_time"], nobody, nobody, m["policy_failed"] > 0),
         "contact": (m["contact_time"], m["contact_delta_v"], m["contact_other"], m["contact_time"] >= 0),
         "off_road": (m["off_road_time"], m["off_road"], nobody, m["off_road_time"] >= 0),
         "red_light": (m["red_light_time"], m["red_lights"], nobody, m["red_light_time"] >= 0),
@@ -67,7 +78,8 @@ def key_moments(
                 who = m["contact_responsibility"][i] if kind == "contact" else np.nan
                 known = not np.isnan(who) and who != Responsibility.NONE
                 responsible = Responsibility(int(who)).name.lower() if known else None
-                rows.append((seed, ego, rank, kind, time, other, value, responsible))
+                reason = reasons.get(seed, NOT_FINITE) if kind == "policy_failed" else None
+                rows.append((seed, ego, rank, kind, time, other, value, responsible, reason))
     columns = list(zip(*rows, strict=True)) or [[]] * len(_COLUMNS)
     return {
         name: np.asarray(column, kind) for (name, kind), column in zip(_COLUMNS.items(), columns, strict=True)

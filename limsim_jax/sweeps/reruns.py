@@ -22,7 +22,7 @@ from limsim_jax.policies.predict import Replayed, constant_velocity
 from limsim_jax.simulation.rollout import Result, Rollout, Started
 from limsim_jax.simulation.trace import Trace
 from limsim_jax.simulation.worlds import Worlds
-from limsim_jax.traffic.engine import Command
+from limsim_jax.traffic.command import Command
 from limsim_jax.types import Config, State
 
 UNSAFE = 4.0

@@ -24,7 +24,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 
@@ -130,6 +130,31 @@ def run_here(episodes: Episodes, chunks: Iterable[Sequence[int]]) -> Iterator[Ou
     return (episodes.run(chunk) for chunk in chunks)
 
 
+OnError = Literal["record", "stop"]
+
+
+class PolicyFailedError(ValueError):
+    """A policy that failed, in one line: in which world, when and why."""
+
+
+def _stopping(run_chunks: RunChunks) -> RunChunks:
+    """The same back end, which raises `PolicyFailedError` at the first episode in which the policy fails."""
+
+    def run(episodes: Episodes, chunks: Iterable[Sequence[int]]) -> Iterator[Outcome]:
+        for outcome in run_chunks(episodes, chunks):
+            moments = outcome.moments
+            for k, kind in enumerate(moments.get("kind", ())):
+                if kind == "policy_failed":
+                    raise PolicyFailedError(
+                        f"{episodes.scenario}/{episodes.policy}: the policy failed in seed "
+                        f"{moments['seed'][k]} at {moments['time'][k]:.1f} s: {moments['reason'][k]}; "
+                        "finished chunks are kept"
+                    )
+            yield outcome
+
+    return run
+
+
 def sweep(
     episodes: Sequence[Episodes],
     seeds: Sequence[int],
@@ -138,6 +163,8 @@ def sweep(
     shard: tuple[int, int] | None = None,
     until_ci: tuple[float, str] | None = None,
     progress: Callable[[Progress], None] | None = None,
+    on_error: OnError = "record",
+    fresh: bool = False,
     run_chunks: RunChunks = run_here,
 ) -> SweepSummary:
     """Run all worlds that are not on disk yet.
@@ -149,23 +176,30 @@ def sweep(
       shard: (i, n) with 0 <= i < n: every n-th chunk, from the i-th on. All n together are the whole.
       until_ci: (half-width, metric): stop once the interval of the metric is so narrow; see the module.
       progress: is told before and after every chunk.
+      on_error: "record" keeps an episode in which the policy fails as a failed one; "stop" ends the sweep
+        there, without its chunk.
+      fresh: remove what `out` holds of these scenarios and policies.
       run_chunks: back end.
 
     Raises:
+      PolicyFailedError: the policy has failed, with `on_error="stop"`.
       ValueError: seeds, shard or until_ci that make no sense, before anything is compiled.
       ResultsError: `out` cannot be written or holds other results. What is finished stays.
     """
     out = Path(out)
     seeds = _checked_seeds(seeds)
-    _check(episodes, shard, until_ci)
+    _check(episodes, shard, until_ci, fresh)
+    if on_error not in get_args(OnError):
+        raise ValueError(f"on_error: '{on_error}'; known are {', '.join(get_args(OnError))}")
     entries = [_entry(one) for one in episodes]
-    register(out, entries)
+    register(out, entries, fresh=fresh)
     damaged: list[str] = []
     jobs: list[tuple[Episodes, Shards, list[int], set[int], _Teller]] = []
     for one, entry in zip(episodes, entries, strict=True):
         mine = _of_shard(seeds, one.chunk, shard)
         tell, shards = _Teller(one, len(mine), progress), Shards(out, entry)
         jobs.append((one, shards, mine, _missing(shards, mine, tell, damaged), tell))
+    run_chunks = _stopping(run_chunks) if on_error == "stop" else run_chunks
     with ThreadPoolExecutor(COMPILERS) as pool:
         # The next scenario compiles while this one runs; but one that may stop early may need no more worlds.
         ready = [
@@ -347,7 +381,10 @@ def _checked_seeds(seeds: Sequence[int]) -> list[int]:
 
 
 def _check(
-    episodes: Sequence[Episodes], shard: tuple[int, int] | None, until_ci: tuple[float, str] | None
+    episodes: Sequence[Episodes],
+    shard: tuple[int, int] | None,
+    until_ci: tuple[float, str] | None,
+    fresh: bool,
 ) -> None:
     if not episodes:
         raise ValueError("no scenario to run")
@@ -357,6 +394,8 @@ def _check(
             raise ValueError(f"{name} is there twice; give every scenario a name of its own")
     if shard is not None and not (shard[1] >= 1 and 0 <= shard[0] < shard[1]):
         raise ValueError(f"shard {shard[0]}/{shard[1]}: the first must be from 0 to the second less 1")
+    if fresh and shard is not None:
+        raise ValueError("fresh would remove the results of other shards; use another directory")
     if until_ci is None:
         return
     if shard is not None:

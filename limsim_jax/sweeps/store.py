@@ -55,6 +55,7 @@ MOMENTS = pa.schema(
         ("module", pa.string()),
         ("avoidable_by_ego", pa.bool_()),
         ("avoidable_by_other", pa.bool_()),
+        ("reason", pa.string()),  # why the policy failed
     ]
 )
 """Columns of the table of key moments; from `other` on they may be null."""
@@ -69,6 +70,15 @@ KEYS = pa.schema(
     ]
 )
 """First columns of the table of episodes; every metric follows as float64, null where not measured."""
+
+_CHANGED = {
+    r"source": "limsim_jax itself has changed since",
+    r"policy_code\.program": "the program of the policy has changed since",
+    r"policy_code\.values": "the numbers that the policy holds have changed since",
+    r"policy_code\.sources\.": "the policy's code in {} has changed since",
+    r"policy_code": "it is not known with which code of the policy they were made",
+}
+"""Differences of provenance in words; what follows in the name goes into the braces."""
 
 _ABANDONED = 3600.0  # s after which an unfinished file is abandoned: writing takes milliseconds
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
@@ -125,10 +135,14 @@ class Entry:
     def difference(self, other: Mapping[str, Any], ignore: frozenset[str] = NOT_COMPARED) -> str | None:
         """The first difference, as "chunk is 32 there and 64 here"."""
         here, there = _plain(self.provenance), _plain(other)
-        return _difference(
+        found = _difference(
             {k: v for k, v in there.items() if k not in ignore},
             {k: v for k, v in here.items() if k not in ignore},
         )
+        for name, words in _CHANGED.items():
+            if found and (told := re.match(rf"'{name}(.*?)' is ", found)):
+                return words.format(told[1])
+        return found
 
 
 @dataclass(frozen=True)
@@ -189,7 +203,7 @@ def open_results(path: str | Path, *, skip_damaged: bool = False) -> Results:
                 raise ResultsError(f"{chunk}; the same sweep run again replaces it")
         if mine:
             rows = pa.concat_tables([chunk.episodes for chunk in mine])
-            events = pa.concat_tables([chunk.moments for chunk in mine])
+            events = _joined([chunk.moments for chunk in mine])
             episodes.append(rows.sort_by([("seed", "ascending"), ("ego", "ascending")]))
             moments.append(
                 events.sort_by([("seed", "ascending"), ("ego", "ascending"), ("rank", "ascending")])
@@ -203,12 +217,17 @@ def open_results(path: str | Path, *, skip_damaged: bool = False) -> Results:
         units |= entry.units
     return Results(
         path=path,
-        episodes=pa.concat_tables(episodes, promote_options="default").combine_chunks(),
-        moments=pa.concat_tables(moments).combine_chunks(),
+        episodes=_joined(episodes).combine_chunks(),
+        moments=_joined([MOMENTS.empty_table(), *moments]).combine_chunks(),
         units=units,
         provenance={(entry.scenario, entry.policy): dict(entry.provenance) for entry in entries},
         damaged=tuple(damaged),
     )
+
+
+def _joined(tables: Sequence[pa.Table]) -> pa.Table:
+    """Tables one after the other; columns that one of them lacks are null there."""
+    return pa.concat_tables(tables, promote_options="default")
 
 
 # --- the index -----------------------------------------------------------------------------------------
@@ -234,8 +253,13 @@ def read_index(path: Path) -> list[Entry]:
     return entries
 
 
-def register(path: Path, entries: Sequence[Entry]) -> None:
+def register(path: Path, entries: Sequence[Entry], *, fresh: bool = False) -> None:
     """Say in the index that the directory holds these; make the directory where there is none.
+
+    Args:
+      path: the directory.
+      entries: what it holds from now on, beside what it held.
+      fresh: remove what it holds of these before.
 
     Raises:
       ResultsError: `path` is a file, cannot be written, or holds one of the entries with another provenance.
@@ -243,12 +267,18 @@ def register(path: Path, entries: Sequence[Entry]) -> None:
     if path.exists() and not path.is_dir():
         raise ResultsError(f"{path}: is a file; results need a directory")
     found = read_index(path) if path.is_dir() else []
+    if fresh and found:
+        names = {(entry.scenario, entry.policy) for entry in entries}
+        _remove(path, [entry for entry in found if (entry.scenario, entry.policy) in names])
+        found = [entry for entry in found if (entry.scenario, entry.policy) not in names]
+        _write_index(path, found)
     by_name = {(entry.scenario, entry.policy): entry for entry in found}
     for entry in entries:
         other = by_name.get((entry.scenario, entry.policy))
         if other and (difference := entry.difference(other.provenance)):
             raise ResultsError(
-                f"{path}: holds other results of {entry.label}: {difference}; use another directory"
+                f"{path}: holds other results of {entry.label}: {difference}; use another directory, or "
+                "start anew (--fresh, fresh=True)"
             )
     for entry in entries:
         folder = path / entry.scenario / entry.policy
@@ -258,16 +288,26 @@ def register(path: Path, entries: Sequence[Entry]) -> None:
     listed = {(entry.scenario, entry.policy) for entry in _listed(path)}
     new = [entry for entry in entries if (entry.scenario, entry.policy) not in listed]
     if new:
-        text = {
-            "format": FORMAT,
-            "what": "results of a sweep of limsim_jax",
-            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-            "entries": [
-                _about(entry)
-                for entry in [*found, *(e for e in new if (e.scenario, e.policy) not in by_name)]
-            ],
-        }
-        _write(path / _INDEX, json.dumps(text, indent=1).encode())
+        _write_index(path, [*found, *(e for e in new if (e.scenario, e.policy) not in by_name)])
+
+
+def _write_index(path: Path, entries: Sequence[Entry]) -> None:
+    text = {
+        "format": FORMAT,
+        "what": "results of a sweep of limsim_jax",
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "entries": [_about(entry) for entry in entries],
+    }
+    _write(path / _INDEX, json.dumps(text, indent=1).encode())
+
+
+def _remove(path: Path, entries: Sequence[Entry]) -> None:
+    """Remove all chunks of these; episodes first, without which moments do not count."""
+    for entry in entries:
+        for kind in ("episodes", "moments"):
+            for file in sorted((path / entry.scenario / entry.policy).glob(f"{kind}-*.parquet")):
+                with _clear(file), contextlib.suppress(FileNotFoundError):
+                    file.unlink()
 
 
 def _listed(path: Path) -> Iterator[Entry]:

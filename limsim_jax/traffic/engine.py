@@ -12,9 +12,8 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, room_beside
 from limsim_jax.maps.routing import NO_ROOM
@@ -23,11 +22,12 @@ from limsim_jax.maps.signals import lane_states
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
 from limsim_jax.traffic.collision import AfterCollision, after_collision
 from limsim_jax.traffic.collision import record as record_events
+from limsim_jax.traffic.command import Command, hold_and_brake, without_broken
 from limsim_jax.traffic.demand import enter
 from limsim_jax.traffic.ego import (
     Control,
     Limits,
-    Trajectory,
+    arrived,
     assign,
     at_slots,
     is_free,
@@ -39,7 +39,7 @@ from limsim_jax.traffic.ego import (
     with_free,
 )
 from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, side_to_look, start
-from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes, tails
+from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes, tails, without
 from limsim_jax.traffic.neighbors import (
     Ahead,
     Obstacles,
@@ -67,22 +67,6 @@ class Traffic:
     after_collision: AfterCollision = "stop"
     look_for_contacts: Literal["step", "decision"] = "step"  # how often bodies are compared
     limits: Limits = field(default_factory=Limits)  # of free egos
-
-
-@struct.dataclass(frozen=True, kw_only=True)
-class Command:
-    """Commands for the egos until the next decision.
-
-    An ego without a command is driven by the traffic model. A free ego follows a trajectory or holds a
-    control; without either it rolls on with straight wheels. An ego that keeps to lanes takes meta-actions.
-    """
-
-    trajectory: Trajectory | None = None
-    control: Control | None = None
-    meta: Int[Array, " E"] | None = None  # `Meta`, or -1: decide like the traffic
-    brake: Bool[Array, " N"] | None = None  # these vehicles, egos or others, brake as hard as they can
-    slot: Int[Array, " E"] | None = None  # that each row of `Egos` drives from now on, -1: none
-    signal: Int[Array, " E"] | None = None  # turn signal of free egos: +1 left, -1 right; others make way
 
 
 class Tick(NamedTuple):
@@ -325,6 +309,7 @@ def drive(
     command = Command() if command is None else command
     if command.slot is not None:
         state = assign(lane_map, state, boxes(lane_map, state), command.slot)
+    state, command, broken = without_broken(state, command)
     if command.signal is not None:  # then other vehicles see it on both lanes
         shows = state.egos.free & (command.signal != 0)
         state = replace(state, side=at_slots(state.egos, command.signal, state.side, shows))
@@ -341,7 +326,7 @@ def drive(
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], Any]:
         state, x = carry
         state = replace(state, **fixed)
-        state, dx, left, off = _step(config, traffic, lane_map, state, decision, x, command, free)
+        state, dx, left, off = _step(config, traffic, lane_map, state, decision, x, command, broken, free)
         x = x + dx
         tick = Tick(state, left, off, config.time(state.step), decision, x, dx, command)
         return (bare(state), x), None if record is None else record(tick)
@@ -364,6 +349,7 @@ def _step(
     decision: Decision,
     x: Float[Array, " N"],
     command: Command,
+    broken: Bool[Array, " E"],
     may_be_free: bool,
 ) -> tuple[State, Float[Array, " N"], Bool[Array, " N"], Bool[Array, " N"] | None]:
     """One physics step, `x` m after the decision.
@@ -380,13 +366,7 @@ def _step(
     a = after_collision(state, a, traffic.after_collision)
     free = None
     if may_be_free and egos.slot.shape[0]:
-        if command.trajectory is not None:
-            now = config.time(state.step)
-            control = track(config, traffic.limits, state, command.trajectory, now)
-        elif command.control is not None:
-            control = command.control
-        else:  # hands off
-            control = Control(acceleration=jnp.zeros_like(egos.x), steering=jnp.zeros_like(egos.x))
+        state, control = _control(config, traffic.limits, state, command, broken)
         wish = control.acceleration
         if command.brake is not None:
             wish = jnp.where(command.brake[egos.slot], -traffic.limits.deceleration, wish)
@@ -399,11 +379,27 @@ def _step(
         dx = jnp.where(is_free(state), free.distance - state.distance, dx)
         left &= ~is_free(state)
         moved = with_free(moved, free)
+        gone = at_slots(egos, arrived(lane_map, moved), jnp.zeros_like(left), egos.free)
+        moved, left = without(moved, gone), left | gone
     state = replace(moved, step=state.step + 1)
     off = None
     if traffic.look_for_contacts == "step":
         state, off = record_events(config, lane_map, state, free=may_be_free)
     return state, dx, left, off
+
+
+def _control(
+    config: Config, limits: Limits, state: State, command: Command, broken: Bool[Array, " E"]
+) -> tuple[State, Control]:
+    """What the drivers of free egos ask for in this step; the state tells which of them are broken."""
+    still = jnp.zeros_like(state.egos.x)
+    if command.trajectory is not None:
+        control = track(config, limits, state, command.trajectory, config.time(state.step))
+    elif command.control is not None:
+        control = command.control
+    else:  # hands off
+        return state, Control(acceleration=still, steering=still)
+    return hold_and_brake(limits, state, control, broken)
 
 
 def _ran_red(lane_map: LaneMap, state: State, before: State) -> State:

@@ -104,19 +104,26 @@ def advance(
     hard = realised < -state.driver.b_max - 0.01
     lane, previous, s, left = _hand_over(lane_map, state, computed_once(state.s + dx))
     state = replace(
-        state,
-        lane=jnp.where(left, NO_LANE, lane),
-        previous=jnp.where(left, NO_LANE, previous),
-        s=jnp.where(left, 0, s),
-        v=jnp.where(left, 0, v),
-        a=jnp.where(left, 0, realised),
-        active=state.active & ~left,
+        without(replace(state, lane=lane, previous=previous, s=s, v=v, a=realised), left),
         distance=state.distance + dx,
         waiting=jnp.where(state.active & (v < DRIVING.walking_speed), state.waiting + config.dt, 0),
         rest=jnp.maximum(state.rest - config.dt, 0),
         status=state.status | jnp.where(hard & state.active, int(Status.HARD_BRAKE), 0),
     )
     return _move_sideways(config, lane_map, state), dx, left
+
+
+def without(state: State, left: Bool[Array, " N"]) -> State:
+    """The state without vehicles that have left at the end of their goal."""
+    return replace(
+        state,
+        lane=jnp.where(left, NO_LANE, state.lane),
+        previous=jnp.where(left, NO_LANE, state.previous),
+        s=jnp.where(left, 0, state.s),
+        v=jnp.where(left, 0, state.v),
+        a=jnp.where(left, 0, state.a),
+        active=state.active & ~left,
+    )
 
 
 def _hand_over(

@@ -3,7 +3,7 @@
 import pytest
 
 import limsim_jax as lj
-from limsim_jax.sweeps.build import describe
+from limsim_jax.sweeps.identity import describe
 
 
 def test_keywords_replace_fields_of_a_file():

@@ -16,7 +16,8 @@ from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.network import ImportReport
 from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.metrics.record import conflict_zones
-from limsim_jax.traffic.engine import Command, Traffic, _until_changed, drive
+from limsim_jax.traffic.command import Command
+from limsim_jax.traffic.engine import Traffic, _until_changed, drive
 from limsim_jax.traffic.lane_change import place_beside
 from limsim_jax.traffic.motion import boxes, tails
 from limsim_jax.traffic.state import start_state

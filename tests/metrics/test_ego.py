@@ -76,7 +76,7 @@ def test_a_free_drive():
         "min_ttc", "min_ttc_time", "min_ttc_1d", "min_ttc_2d", "min_thw", "max_drac", "max_drac_time",
         "min_pet", "min_pet_time", "min_distance", "rss_first_time", "contact_time", "contact_other",
         "contact_type", "contact_at_fault", "contact_responsibility", "contact_delta_v", "max_delta_v",
-        "off_road_time", "red_light_time",
+        "off_road_time", "red_light_time", "policy_failed_time",
     }  # fmt: skip
     # without traffic the limit is the reference: 10 of 15 m/s
     assert found["limsim_faithful_efficiency"] == pytest.approx(10 / 15, rel=1e-4)
@@ -240,7 +240,7 @@ def test_a_contact_at_the_fault_of_the_other_vehicle():
     assert Responsibility(int(found["contact_responsibility"])) == Responsibility.OTHER
     assert found["nuplan_no_at_fault_collisions"] == found["nuplan_ttc"] == 1.0  # it comes from behind
     assert found["nuplan_score"] > 0.7
-    assert found["carla_penalty"] == pytest.approx(0.6)  # CARLA does not ask
+    assert found["carla_penalty"] == pytest.approx(0.6)  # CARLA asks only whether the ego stands
     assert found["limsim_faithful_drive"] < 0.7 * found["limsim_corrected_drive"]
 
 
@@ -373,6 +373,104 @@ def test_an_ego_that_left_is_not_followed_by_another():
     assert found["success"] == found["completion"] == 1.0
     assert found["wrong_way"] == found["off_road"] == found["max_overspeed"] == 0.0
     assert found["min_acceleration"] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_the_step_of_arrival_counts_in_time_and_distance():
+    r = free(61, v=np.linspace(8.0, 12.0, 61), arrived=np.arange(61) == 30)
+    there = measure({k: x.copy() for k, x in r.items()})
+    r["active"][30:, 0] = False
+    r["to_go"][30:] = 0.0
+    found = measure(r)
+    assert found["duration"] == there["duration"] == pytest.approx(3.0)
+    assert found["distance"] == pytest.approx(r["moved"][:31].sum()) == there["distance"]
+    assert found["mean_speed"] == pytest.approx(r["moved"][:31].sum() / 3.0, rel=1e-5)
+    assert found["progress"] == pytest.approx(200.0)  # to the goal itself
+
+
+# --- failures that end an episode early ------------------------------------------------------------------
+
+SCORES = ("nuplan_score", "carla_score", "limsim_faithful_total", "limsim_corrected_total")
+
+
+@pytest.mark.parametrize("step", [1, 4, 30])
+def test_a_policy_that_breaks_is_a_failure_with_scores_of_0(step):
+    r = free(61, broken=np.arange(61) >= step, arrived=np.arange(61) >= 40)
+    r["v"][step:] = 99.0  # numbers of that step and later do not count
+    found = measure(r)
+    assert (found["policy_failed"], found["success"], found["arrived"]) == (1.0, 0.0, 0.0)
+    assert found["policy_failed_time"] == pytest.approx(3.0 + step * DT, abs=1e-4)
+    assert found["duration"] == pytest.approx(step * DT, abs=1e-4)
+    assert found["distance"] == pytest.approx((step - 1) * DT * 10, abs=1e-3)
+    assert [found[name] for name in SCORES] == [0.0] * 4
+    fine = measure(free(61))
+    assert (fine["policy_failed"], fine["policy_failed_time"]) == (0.0, None)
+    if step > 1:  # otherwise no step is driven
+        assert {k for k, x in found.items() if x is None} < {k for k, x in fine.items() if x is None}
+
+
+def test_out_of_time_is_an_ego_that_is_still_on_its_way():
+    steps = np.arange(STEPS)
+    assert measure(free(STEPS))["out_of_time"] == 1.0
+    assert measure(free(STEPS, arrived=steps == 70))["out_of_time"] == 0.0
+    assert measure(free(STEPS, broken=steps >= 70))["out_of_time"] == 0.0
+    assert measure(free(STEPS, off_road=steps == 20))["out_of_time"] == 0.0  # it failed before
+    assert measure(free(STEPS - 1))["out_of_time"] == 0.0  # it left elsewhere
+
+
+def test_a_policy_that_breaks_as_the_ego_arrives_has_failed():
+    found = measure(free(61, broken=np.arange(61) >= 30, arrived=np.arange(61) == 30))
+    assert (found["policy_failed"], found["arrived"], found["success"]) == (1.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("steps", [2, 5, 9, 15])
+def test_nothing_is_missing_because_the_ego_crashed_early(steps):
+    """It drives into a standing car, or is hit from behind, and the episode ends within the second."""
+
+    def crash(steps, ahead):
+        r = record(61, (0, 0, 0, 10.0), [(0, 0, 0, 0.0 if ahead else 14.0)])
+        r["box"][:, 1, 0] = r["box"][:, 0, 0] + (LENGTH + 0.5) * (1 if ahead else -1)
+        r["box"][steps - 1 :, 1, 0] = r["box"][steps - 1 :, 0, 0] + (LENGTH - 0.2) * (1 if ahead else -1)
+        r["active"][steps:, 0] = False
+        return measure(r)
+
+    for ahead in (True, False):
+        late, early = crash(61, ahead), crash(steps, ahead)
+        assert early["contacts"] == late["contacts"] == 1.0
+        assert {k for k, x in early.items() if x is None} == {k for k, x in late.items() if x is None}
+        if steps < 10:
+            assert early["limsim_corrected_total"] == early["limsim_faithful_total"] == 0.0
+            assert early["worst_second"] == 0.0
+            assert early["worst_second_time"] == pytest.approx(early["contact_time"], abs=1e-4)
+        assert (early["nuplan_score"] == 0.0) == ahead
+
+
+def test_carla_counts_no_contact_of_a_standing_ego_and_repeats_within_5_m_once():
+    """Cars touch it one after the other, each for a step."""
+
+    def touched(at, v=10.0):
+        r = record(61, (0, 0, 0, v), [(0, 40, 0, 0.0)] * 3)
+        r["box"][:, 1:, 1] = 40.0
+        for k, step in enumerate(at, 1):
+            r["box"][step, k, :2] = r["box"][step, 0, :2] + np.array([0.0, WIDTH - 0.1])
+        found = measure(r)
+        assert found["contacts"] == len(at)
+        assert found["carla_penalty"] == pytest.approx(0.6 ** found["carla_collisions"], rel=1e-5)
+        return found["carla_collisions"]
+
+    assert touched([10, 20, 30]) == 3.0  # 10 m apart
+    assert touched([10, 14]) == 1.0  # 4 m
+    assert touched([10, 14, 17]) == 2.0  # 4 m, and 7 m from the one that counted
+    assert touched([10, 20], v=0.0) == 0.0
+    assert touched([10, 20], v=0.09) == 0.0 and touched([10], v=0.11) == 1.0
+    # away and back: the ego has been farther than 5 m from the first place
+    away = np.where(np.arange(61) < 20, 10.0, 0.0)
+    r = record(61, (0, 0, 0, away), [(0, 40, 0, 0.0)] * 3)
+    r["box"][:, 1:, 1] = 40.0
+    r["box"][25:, 0, 0] = r["box"][10, 0, 0]
+    r["velocity"][25:, 0, 0] = 1.0
+    for k, step in ((1, 10), (2, 30)):
+        r["box"][step, k, :2] = r["box"][step, 0, :2] + np.array([0.0, WIDTH - 0.1])
+    assert measure(r)["carla_collisions"] == 2.0
 
 
 def test_an_ego_that_was_lost_is_not_followed_by_another():

@@ -10,7 +10,7 @@ def test_every_party_of_a_contact_has_words():
 
 
 def test_kinds_have_words_and_values_have_units():
-    assert moments.ORDER[0] == "contact"
+    assert moments.ORDER[:2] == ("policy_failed", "contact")
     assert moments.words("near_miss") == "near miss" and moments.words("my_own") == "my own"
     assert moments.value_text("contact", 3.21) == "delta-v 3.2 m/s"
     assert moments.value_text("off_road", 0.5) == ""

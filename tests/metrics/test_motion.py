@@ -74,8 +74,7 @@ def test_a_stream_gives_what_scipy_gives_on_the_whole_record(name, n, dt, window
 
     carry, (y, new) = jax.lax.scan(step, filter_init(kept, 2), jnp.asarray(x, jnp.float32))
     rest, valid = filter_result(kept, carry)
-    assert valid.all()
-    found = np.concatenate([np.asarray(y)[np.asarray(new)], rest])
+    found = np.concatenate([np.asarray(y)[np.asarray(new)], np.asarray(rest)[np.asarray(valid)]])
     smooth = savgol(x, windows[0], 2, axis=0)
     expected = {
         "acceleration": smooth,
@@ -86,6 +85,29 @@ def test_a_stream_gives_what_scipy_gives_on_the_whole_record(name, n, dt, window
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("dt", [0.05, 0.1, 0.25, 0.5])
+@pytest.mark.parametrize("name", ["acceleration", "jerk", "yaw_rate", "yaw_acceleration"])
+def test_a_record_shorter_than_a_filter_is_one_polynomial(name, dt):
+    kept = getattr(filters(dt), name)
+    update = jax.jit(lambda carry, row: filter_update(kept, carry, row, jnp.ones((), bool)))
+    rng = np.random.default_rng(3)
+    for n in {1, 2, 3, 4, kept.window - 2, kept.window - 1} & set(range(1, kept.window)):
+        x = rng.normal(size=(n, 2)) + 3.0
+        carry, news = filter_init(kept, 2), []
+        for row in jnp.asarray(x, jnp.float32):
+            carry, _, new = update(carry, row)
+            news.append(bool(new.any()))
+        assert not any(news)  # all values are known at the end only
+        found, valid = (np.asarray(part) for part in filter_result(kept, carry))
+        assert valid.sum() == n
+        t = np.arange(n) * dt
+        for column in (0, 1):
+            fit = np.polynomial.Polynomial.fit(t, x[:, column], min(kept.order, n - 1))
+            expected = fit.deriv(kept.derivative)(t) if kept.derivative else fit(t)
+            scale = max(1.0, np.abs(expected).max())
+            np.testing.assert_allclose(found[valid][:, column] / scale, expected / scale, atol=1e-4)
+
+
 def test_a_filter_whose_edges_look_further_than_its_middle_is_refused():
     def odd(x):
         y = x.copy()
@@ -93,7 +115,7 @@ def test_a_filter_whose_edges_look_further_than_its_middle_is_refused():
         return y
 
     with pytest.raises(ValueError, match="edges"):
-        stream(odd, 9)
+        stream(odd, 9, 2, 0, DT)
 
 
 def test_extremes_are_those_of_the_whole_record():
@@ -159,15 +181,16 @@ def test_comfort_has_nuplans_bounds(a, heading, comfortable):
     assert found["comfortable"] == float(comfortable)
 
 
-def test_a_short_record_has_no_value_and_no_nan():
-    n = 22  # acceleration and yaw are known; jerk needs 23 accelerations
-    raw = streamed(*(jnp.ones(n) for _ in range(3)))
+@pytest.mark.parametrize("n", [2, 3, 9, 22])
+def test_a_short_record_has_all_values(n):
+    raw = streamed(*(jnp.full(n, x) for x in (10.0, -5.0, 0.0)))
     found = on_host(raw)
-    assert found["max_jerk"] is None
-    assert found["comfortable"] is None
-    assert found["max_acceleration"] == pytest.approx(1.0, abs=1e-5)
     assert all(bool(jnp.isfinite(x.value).all()) for x in raw.values())
-    assert on_host(streamed(*(jnp.ones(1) for _ in range(3))))["max_yaw_rate"] is None
+    assert found["min_acceleration"] == pytest.approx(-5.0, abs=1e-5)
+    assert found["max_jerk"] == found["max_yaw_rate"] == pytest.approx(0.0, abs=1e-4)
+    assert found["comfortable"] == 0.0
+    alone = on_host(streamed(*(jnp.ones(1) for _ in range(3))))  # nothing is driven yet
+    assert alone["max_acceleration"] is alone["comfortable"] is None
 
 
 def test_windows_keep_their_length_in_seconds():

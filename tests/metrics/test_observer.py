@@ -47,6 +47,8 @@ def test_plain_columns_are_those_of_the_state():
         ego, traffic = record.ego, record.traffic
         assert ego.t == tick.time == traffic.t
         assert ego.slot == slot and ego.v == state.v[slot] and ego.a == state.a[slot]
+        assert ego.moved == tick.dx[slot] and record.goal == state.goal[slot]
+        assert ego.broken == (Status.NOT_FINITE in Status(int(state.status[slot])))
         assert ego.rear_axle == pytest.approx(0.5 * state.shape.wheelbase[slot])
         np.testing.assert_array_equal(ego.b_max, state.driver.b_max)
         for name in ("active", "lane", "s", "v", "entered"):
@@ -406,7 +408,8 @@ def test_progress_arrival_and_signs_over_time():
                 state, left, dx = tick.state, tick.left, tick.dx
             lane, s = state.lane[slot], state.s[slot]
             on_route = bool(m.routes.reachable[lane, goal]) if lane != NO_LANE else False
-            leaves = bool(left[slot] and was != NO_LANE and m.routes.is_goal[was, goal])
+            at_goal = state.goal[slot] == goal or (was != NO_LANE and m.routes.is_goal[was, goal])
+            leaves = bool(left[slot] and at_goal)
             passed = lane != NO_LANE and s > m.length[lane] and state.active[slot]
             passed = passed and m.routes.is_goal[lane, state.goal[slot]]
             reached = bool(passed and m.routes.is_goal[lane, goal])

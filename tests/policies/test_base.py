@@ -27,8 +27,8 @@ from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.pdm import PDMClosed
 from limsim_jax.policies.reference import reference_path
 from limsim_jax.policies.simple import FollowLane
+from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Control, from_lane
-from limsim_jax.traffic.engine import Command
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config
 

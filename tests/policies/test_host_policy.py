@@ -14,7 +14,8 @@ from traffic_worlds import bundled, no_arrivals, state_of
 from limsim_jax.maps.lane_map import lane_rows, pose
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.policies import host
-from limsim_jax.policies.host import HostPolicy, Observe
+from limsim_jax.policies.base import named
+from limsim_jax.policies.host import HostPolicy, Observe, failure_reasons
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweeps.episode import Episodes
@@ -22,7 +23,7 @@ from limsim_jax.sweeps.experiment import ExperimentFile
 from limsim_jax.traffic.ego import Meta, from_lane
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import boxes
-from limsim_jax.types import Config, Scenario
+from limsim_jax.types import Config, Scenario, Status
 
 pytestmark = pytest.mark.engine
 
@@ -236,15 +237,61 @@ def test_bad_options_are_named():
         HostPolicy(follow, samples=1)
 
 
-def test_numbers_that_are_not_finite_end_the_run():
-    def late(seen):
-        a = np.where(seen.time[:, None] > 0.7, np.nan, 0.0) + 0 * seen.v
-        return {"acceleration": a, "steering": 0 * seen.v}
+def failing(how: str):
+    """A planner that fails from 1 s on where the leader drives at less than 12 m/s."""
+    asked: list[int] = []
 
-    state = world(60.0, 17.0)
-    ask(HostPolicy(late), state)
-    with pytest.raises(Exception, match=r"late: acceleration of ego 0 in world 0 of the call is nan"):
-        jax.block_until_ready(ask(HostPolicy(late), dataclasses.replace(state, step=jnp.int32(8))))
+    def plan(seen):
+        asked.append(len(seen.v))
+        bad = (seen.time[:, None] >= 1.0) & (seen.other_v[..., 0] < 12.0) & seen.there[..., 0]
+        if bad.any() and how == "raises":
+            raise RuntimeError("no plan")
+        a = np.where(bad & (how == "nan"), np.nan, 0.1 * seen.v)
+        return {"acceleration": a, "steering": 0 * seen.v} if how != "shape" or not bad.any() else {}
+
+    return HostPolicy(plan), asked
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ("nan", None),
+        ("raises", r"test_host_policy.py:\d+ in plan: RuntimeError: no plan"),
+        ("shape", "failing.<locals>.plan: returns a mapping of , not a mapping of acceleration, steering"),
+    ],
+)
+def test_a_world_in_which_the_planner_fails_is_lost_alone(how, said):
+    (sound, _), (broken, asked) = failing("not at all"), failing(how)
+    states = [world(40.0, v) for v in (8.0, 9.0, 10.0)]
+    states[1] = dataclasses.replace(states[1], v=states[1].v.at[1].set(7.0))  # there it fails
+
+    def ends(policy):
+        run = rollout(policy, 4.0)
+        return jax.jit(jax.vmap(lambda state: run_one(run, state)[0].state))(stack(states))
+
+    whole, end = ends(sound), ends(broken)
+    flagged = np.asarray(end.status & int(Status.NOT_FINITE)) != 0
+    np.testing.assert_array_equal(flagged, [[False] * N, [True, False, False, False], [False] * N])
+    for k in (0, 2):
+        assert float(end.egos.x[k, 0]) == float(whole.egos.x[k, 0])
+    assert float(end.v[1, 0]) == 0.0 and float(whole.v[1, 0]) > 5.0  # it brakes to a standstill
+    assert all(bool(jnp.isfinite(x).all()) for x in (end.v, end.s, end.egos.x, end.egos.heading))
+    reasons = failure_reasons(broken)
+    if said is None:
+        assert not reasons
+    else:
+        (key,) = reasons  # once: after that the function is not shown this world any more
+        assert re.fullmatch(said, reasons[key])
+        expected = jax.random.fold_in(jax.random.key(0), 10)  # the decision at 1 s, in this world's key
+        assert key == np.asarray(jax.random.key_data(expected)).tobytes()
+        assert asked.count(1) == 3 + 1 and set(asked) == {1, 3}  # the trial, and each world alone once
+    assert not failure_reasons(sound) and failure_reasons(named("other", broken)) == {}
+
+
+def test_a_meta_action_that_does_not_exist_is_broken():
+    policy = HostPolicy(lambda seen: {"meta": np.full(seen.v.shape, len(Meta))}, command="meta")
+    end = run_one(rollout(policy, 1.0), world(60.0, 17.0, free=False))[0].state
+    assert int(end.status[0]) & int(Status.NOT_FINITE)
 
 
 def experiment(policy) -> ExperimentFile:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_results import NAN, crashes, made
+from fake_results import NAN, broken_policies, crashes, made
 from fake_traces import small_trace
 
 from limsim_jax.report import tables
@@ -139,6 +139,39 @@ def test_success_comes_first_and_colours_the_verdict(tmp_path):
     text = " ".join(read(write_report(made(two), tmp_path / "r.html")).text.split())
     assert "Success: fast 100 %, slow 0 % of 6 episodes in all." in text
     assert "highway: fast, slow" in text  # the title
+
+
+def test_a_broken_policy_comes_before_everything_else(tmp_path):
+    path = write_report(broken_policies(), tmp_path / "r.html", worst=2)
+    body = path.read_text().partition('<div class="verdict ')[2]
+    assert body.startswith('bad">')
+    text = " ".join(read(path).text.split())
+    first = (
+        "Broken policy: policy like_traffic failed in 2 of 40 episodes of highway: mine.py:7 in plan: "
+        "ValueError: no path (seeds 3, 30)."
+    )
+    second = "failed in 1 of 40 episodes of highway: a command that is not finite (seed 17)."
+    assert text.index(first) < text.index(second) < text.index("Success: 90 % of 40 episodes.")
+    assert "Policy failed at 2.5 s: mine.py:7 in plan: ValueError: no path" in text  # the card
+    assert "POLICY FAILED" in text and "POLICY FAILED" not in read(write_report(thousand(20), path)).text
+
+
+def test_failures_are_grouped_by_cause_and_link_their_replays(tmp_path):
+    late = np.arange(40) >= 30
+    columns = {
+        "success": ~late * 1.0,
+        "arrived": ~late * 1.0,
+        "out_of_time": late * 1.0,
+        "contacts": [0] * 40,
+    }
+    path = write_report(made({GROUP: columns}), tmp_path / "r.html", worst=0)
+    text = " ".join(read(path).text.split())
+    assert "Why episodes fail" in text and "failures" in read(path).ids
+    assert "out of time1025 %30, 31, 32, 33, 34, 35" in text
+    rows = content.failures(tables.groups(made({GROUP: columns})), {(*GROUP, 38): "replays/38.html"})
+    assert rows[0]["cells"][0]["seeds"][:2] == [(38, "replays/38.html"), (30, None)]
+    good = write_report(made({GROUP: {"success": [1.0], "arrived": [1.0]}}), path, worst=0)
+    assert "Why episodes fail" not in read(good).text
 
 
 def test_demand_that_finds_no_room_is_told(tmp_path):

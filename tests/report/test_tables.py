@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_results import NAN, ONE, UNITS, crashes, made
+from fake_results import NAN, ONE, UNITS, broken_policies, crashes, made
 from pyarrow.csv import read_csv
 
 from limsim_jax.metrics.catalog import describe
@@ -115,6 +115,57 @@ def test_no_episodes_and_a_level_that_is_none():
     empty = Results(Path("there"), results.episodes.slice(0, 0), results.moments, {}, {})
     with pytest.raises(ValueError, match="there holds no finished"):
         summary(empty)
+
+
+def test_a_broken_policy_is_worse_than_any_crash_and_heads_the_table():
+    found = worst(broken_policies(), k=5).to_pylist()
+    assert [row["seed"] for row in found][:4] == [3, 17, 30, 5]
+    assert [row["policy_failed"] for row in found] == [True, True, True, False, False]
+    assert found[0]["kind"] == "policy_failed" and found[0]["reason"].startswith("mine.py:7")
+    cells = [row[0] for row in headline(broken_policies()).rows]
+    assert cells[1:3] == ["POLICY FAILED, %", "success, %"]
+    assert "POLICY FAILED, %" not in [row[0] for row in headline(crashes()).rows]
+
+
+def test_failed_policies_are_told_by_reason():
+    failures = tables.failed_policies(broken_policies())
+    assert [(failure.seeds, failure.episodes) for failure in failures] == [([3, 30], 40), ([17], 40)]
+    assert tables.failed_policies(crashes()) == []
+    many = tables.Failure(ONE, "boom", list(range(9)), 1000)
+    assert many.text == (
+        "policy like_traffic failed in 9 of 1,000 episodes of highway: boom (seeds 0, 1, 2, 3, 4, 5, ...)"
+    )
+
+
+def failing() -> Results:
+    """An episode for each cause of failure, in their order, and two successes."""
+    flags = ("policy_failed", "at_fault_contacts", "contacts", "off_road", "out_of_time")
+    n = len(tables.CAUSES) + 2
+    columns: dict[str, Any] = {name: np.zeros(n) for name in flags}
+    for k, name in enumerate(flags):
+        columns[name][k] = 1
+    columns["contacts"][1] = 1
+    columns["out_of_time"][0] = 1  # the first cause counts
+    columns["arrived"] = np.isin(np.arange(n), (6, 7, 8)) * 1.0
+    columns["success"] = np.isin(np.arange(n), (7, 8)) * 1.0
+    return made({ONE: columns})
+
+
+def test_causes_of_failure():
+    found = tables.causes(failing().episodes).tolist()
+    assert found == [*tables.CAUSES, "", ""]
+    note = headline(failing()).notes[0]
+    assert note == (
+        "highway: 7 of 9 without success: 1 the policy failed, 1 contact at the ego's fault, 1 other "
+        "contact, 1 off the road, 1 out of time, 1 left elsewhere than at its goal, 1 arrived against the "
+        "criteria of success."
+    )
+    cells = [row[0] for row in headline(failing()).rows]
+    assert cells[2:4] == ["success, %", "out of time, %"]
+    calm = made({ONE: {"success": [1, 1], "arrived": [1, 1], "contacts": [0, 0]}})
+    assert tables.causes(calm.episodes).tolist() == ["", ""]
+    assert headline(calm).notes[0].startswith("Brackets") and "out of time, %" not in str(headline(calm))
+    assert tables.causes(made({ONE: {"contacts": [1]}}).episodes).tolist() == [""]  # success is not known
 
 
 def test_the_worst_seeds_are_ranked_by_severity():

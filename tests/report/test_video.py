@@ -212,9 +212,11 @@ def test_captions_tell_key_moments_while_they_happen(world):
 
 
 def arriving(trace: Trace, step: int) -> Trace:
-    """The same with an ego that has 0 m to go from a step on."""
-    to_go = np.maximum(0.5 * (step - np.arange(T)), 0.0)
-    return trace._replace(driven=np.full((T, 1), OWN), to_go=to_go)
+    """The same with an ego that has left at its goal in the step after this one."""
+    active, t = trace.active.copy(), np.arange(T)
+    active[step + 1 :, OWN] = False
+    to_go = np.where(t <= step, 0.5 * (step + 1 - t), np.where(t == step + 1, 0.0, np.nan))
+    return trace._replace(active=active, driven=np.full((T, 1), OWN), to_go=to_go)
 
 
 def test_an_ego_ends_where_it_arrives_or_leaves(world):
@@ -249,7 +251,7 @@ def test_an_ego_is_not_drawn_after_its_arrival(world, tmp_path):
     scene = Scene(network, lane_map, arriving(trace, 5), [OWN])
     assert scene.active[:, OWN].tolist() == [True] * 6 + [False] * 6
     assert scene.active[:, HIT].all()
-    assert Captions(scene, []).at(0.6) == ("arrived, at 0.6 s", None)
+    assert Captions(scene, []).at(0.6) == ("arrived, at 0.7 s", None)
     fields: Any = [None if x is None else np.repeat(x, 5, 0) for x in arriving(trace, 2)]
     long = Trace(*fields)._replace(time=0.1 * np.arange(1, 5 * T + 1))
     write_video(tmp_path / "a.gif", network, lane_map, long, egos=[OWN], every=10)

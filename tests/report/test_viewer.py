@@ -139,14 +139,17 @@ def test_a_clock_that_stands_still_ends_the_replay(world, tmp_path):
 
 def test_what_follows_the_arrival_of_the_ego_is_left_out(world, tmp_path):
     network, lane_map, trace = world
-    there = trace._replace(to_go=np.maximum(30.0 - trace.time * 10, 0.0))  # 3 s
+    to_go = np.maximum(30.0 - np.asarray(trace.time) * 10, 0.0)  # 3 s
+    active = np.array(trace.active)
+    active[to_go <= 0, SELF] = False
+    there = trace._replace(active=active, to_go=to_go)
     write_viewer(tmp_path / "a.html", network, lane_map, there, ego=SELF)
     meta, columns = payload(tmp_path / "a.html")
     assert (
         meta["arrived"] == pytest.approx(3.0, abs=0.11) and meta["steps"] == round(10 * meta["arrived"]) + 20
     )
     on = columns["vehicle"][SELF] > 0
-    assert on.sum() == round(10 * meta["arrived"])
+    assert on.sum() == round(10 * meta["arrived"]) - 1
     assert [(row["label"], row["time"]) for row in meta["moments"]] == [("arrived", meta["arrived"])]
     late = [{"kind": "unsafe", "time": 5.5}]
     write_viewer(tmp_path / "b.html", network, lane_map, there, ego=SELF, moments=late)

@@ -20,6 +20,7 @@ FLAGS = (
     "red_light",
     "stop_sign",
     "waits_at_red",
+    "broken",
 )
 
 
@@ -54,6 +55,7 @@ def record(steps, ego, others=(), **changes) -> dict[str, Any]:
         "lane_heading": np.full(steps, float(ego[2])),
         "speed_limit": np.full(steps, 15.0),
         "to_go": 200.0 - way,
+        "moved": np.diff(way, prepend=0.0),
         "v_others": np.zeros(steps),
         "others": np.zeros(steps, bool),
         "zone": np.full((steps, 2), -1, np.int32),

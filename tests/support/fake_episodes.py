@@ -33,6 +33,7 @@ class FakeEpisodes:
     failures: float = 0.1  # share of worlds
     version: str = "1"
     device: str = "abacus"
+    breaks: tuple[int, ...] = ()  # seeds in which the policy fails
     note: Path | None = None  # where to write the id of the process for each chunk
     ran: list[int] = field(default_factory=list)
     compiled: int = 0
@@ -84,6 +85,23 @@ class FakeEpisodes:
             "responsible": np.tile(np.array(["ego", None], object), n),
             "avoidable_by_ego": np.tile(np.array([True, None], object), n),
         }
+        broken = worlds[np.isin(worlds, self.breaks)]
+        if broken.size:
+            own = {
+                "kind": "policy_failed",
+                "rank": 1,
+                "time": 2.5,
+                "other": -1,
+                "reason": "my.py:3 in f: boom",
+            }
+            moments = {
+                name: np.concatenate([moments.get(name, np.full(2 * n, None)), values])
+                for name, values in {
+                    **{name: np.full(broken.size, x, object) for name, x in own.items()},
+                    "seed": broken, "ego": np.zeros(broken.size, np.int32),
+                    **{x: np.full(broken.size, None) for x in ("value", "responsible", "avoidable_by_ego")},
+                }.items()
+            }  # fmt: skip
         egos = np.zeros(len(worlds), np.int32)
         return Outcome(worlds, egos, metrics, moments, mixed(worlds + 1000003 * self.salt))
 

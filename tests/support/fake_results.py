@@ -46,6 +46,28 @@ def made(
     )
 
 
+def broken_policies() -> Results:
+    """Of 40 episodes the policy fails in three, for two reasons; seed 5 is a contact at fault."""
+    own: dict[str, Any] = dict(zip(("scenario", "policy"), ONE, strict=True), rank=1, kind="policy_failed")
+    failed = np.isin(np.arange(40), (3, 17, 30)) * 1.0
+    contacts = (np.arange(40) == 5) * 1.0
+    times = np.where(failed > 0, 2.5, NAN)
+    return made(
+        {
+            ONE: {
+                "policy_failed": failed, "policy_failed_time": times,
+                "success": 1 - np.maximum(failed, contacts), "arrived": 1 - np.maximum(failed, contacts),
+                "contacts": contacts, "at_fault_contacts": contacts, "min_ttc": np.full(40, 9.0),
+            }
+        },
+        [
+            dict(own, seed=3, time=2.5, reason="mine.py:7 in plan: ValueError: no path"),
+            dict(own, seed=17, time=2.5, reason="a command that is not finite"),
+            dict(own, seed=30, time=2.5, reason="mine.py:7 in plan: ValueError: no path"),
+        ],
+    )  # fmt: skip
+
+
 def crashes() -> Results:
     """Seed: 0 nothing; 1 near; 2 nearer; 3 off the road; 4, 5 not at fault; 6 at fault, light; 7 shared."""
     own: dict[str, Any] = dict(zip(("scenario", "policy"), ONE, strict=True))

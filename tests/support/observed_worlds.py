@@ -18,7 +18,8 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap, elevation, pose, width
 from limsim_jax.metrics.observer import EvaluateEgo, StepRecord
 from limsim_jax.metrics.safety import NO_GAP
 from limsim_jax.traffic.collision import off_road
-from limsim_jax.traffic.engine import Command, Tick
+from limsim_jax.traffic.command import Command
+from limsim_jax.traffic.engine import Tick
 from limsim_jax.traffic.motion import Decision, boxes
 from limsim_jax.traffic.neighbors import Obstacles, other_lane
 from limsim_jax.traffic.state import start_state

@@ -3,13 +3,17 @@
 import functools
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from ego_records import as_steps, free
 
 from limsim_jax.maps.lane_map import NO_LANE
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import lane_states
+from limsim_jax.metrics.ego import EgoMetrics
+from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import encounter, overlaps
 from limsim_jax.sweeps import episode
 from limsim_jax.sweeps.episode import Episodes, _succeeds
@@ -212,19 +216,45 @@ def test_key_moments_are_ranked():
             max_drac_time=[5.0, 4.0], max_drac=[3.3, 4.4], rss_first_time=[2.0, nan],
             off_road_time=[nan, 13.0], off_road=[0, 0.1],
             worst_second_time=[8.0, 9.0], worst_second=[50.0, 49.5],
+            policy_failed=[1.0, 0.0], policy_failed_time=[9.5, nan],
         ),
+        {9: "of another episode"},
     )  # fmt: skip
     table = list(zip(*(found[name].tolist() for name in ("seed", "rank", "kind", "time")), strict=True))
     assert table == [
-        (7, 1, "near_miss", 3.0),  # 3.3 m/s^2 is not hard
-        (7, 2, "unsafe", 2.0),
+        (7, 1, "policy_failed", 9.5),
+        (7, 2, "near_miss", 3.0),  # 3.3 m/s^2 is not hard
+        (7, 3, "unsafe", 2.0),
         (9, 1, "contact", 12.0),
         (9, 2, "off_road", 13.0),
         (9, 3, "hard_brake", 4.0),  # the near miss is that contact
         (9, 4, "score_drop", 9.0),
     ]
-    assert found["responsible"].tolist() == [None, None, "ego", None, None, None]
-    assert found["other"].tolist()[2] == 4 and found["value"].tolist()[2] == 6.5
+    assert found["responsible"].tolist() == [None, None, None, "ego", None, None, None]
+    assert found["other"].tolist()[3] == 4 and found["value"].tolist()[3] == 6.5
+    assert found["reason"].tolist() == ["a command that is not finite", *[None] * 6]
+
+
+@pytest.mark.parametrize("dt", [0.25, 0.3, 0.5])
+def test_every_time_step_that_a_file_may_name_is_measured(dt):
+    """Metrics of a drive at constant speed; no engine is compiled."""
+    metrics = EgoMetrics(dt)
+    r = {name: x[:: round(dt / 0.1)][:14] if np.ndim(x) else x for name, x in free(61).items()}
+    r["t"] = np.arange(len(r["v"])) * dt
+    r["moved"] = np.full(len(r["v"]), 10.0 * dt)
+    steps = as_steps(r)
+
+    @jax.jit
+    def run(steps):
+        carry = metrics.init(1, steps.zones.id.shape[1])
+        carry = jax.lax.scan(lambda carry, step: (metrics.update(carry, step), None), carry, steps)[0]
+        return metrics.result(carry)
+
+    found = on_host(jax.device_get(run(steps)))
+    assert found["duration"] == pytest.approx((len(r["v"]) - 1) * dt, rel=1e-5)
+    assert found["mean_speed"] == pytest.approx(10.0, rel=1e-5)
+    assert found["max_jerk"] == found["max_yaw_rate"] == pytest.approx(0.0, abs=1e-4)
+    assert found["comfortable"] == 1.0 and found["limsim_corrected_total"] is not None
 
 
 def test_success_is_what_the_file_says():

@@ -20,8 +20,8 @@ from paths import REPO
 from limsim_jax import files
 from limsim_jax.statistics import bootstrap, wilson
 from limsim_jax.sweeps import runner
-from limsim_jax.sweeps.runner import Progress, run_here, sweep, verify
-from limsim_jax.sweeps.store import Results, ResultsError, open_results
+from limsim_jax.sweeps.runner import PolicyFailedError, Progress, run_here, sweep, verify
+from limsim_jax.sweeps.store import Entry, Results, ResultsError, open_results
 
 FAKE = [sys.executable, "-B", str(REPO / "tests" / "support" / "fake_episodes.py")]
 
@@ -68,6 +68,73 @@ def test_more_seeds_are_added(tmp_path):
     sweep(fakes, range(41), tmp_path / "out")
     assert fakes[0].ran == list(range(13, 41))
     assert open_results(tmp_path / "out").digest == whole
+
+
+def test_a_policy_that_fails_is_recorded_or_stops_the_sweep(tmp_path):
+    sweep([FakeEpisodes(breaks=(9, 30))], range(40), tmp_path / "all")
+    rows = [
+        row for row in open_results(tmp_path / "all").moments.to_pylist() if row["kind"] == "policy_failed"
+    ]
+    assert [(row["seed"], row["reason"]) for row in rows] == [
+        (9, "my.py:3 in f: boom"),
+        (30, "my.py:3 in f: boom"),
+    ]
+    said = "^flat/still: the policy failed in seed 9 at 2.5 s: my.py:3 in f: boom; finished chunks are kept$"
+    with pytest.raises(PolicyFailedError, match=said):
+        sweep([FakeEpisodes(breaks=(9, 30))], range(40), tmp_path / "stop", on_error="stop")
+    assert seeds_of(open_results(tmp_path / "stop")) == list(range(8))
+    fake = FakeEpisodes(breaks=(9, 30))
+    sweep([fake], range(40), tmp_path / "stop")
+    assert fake.ran == list(range(8, 40))
+    with pytest.raises(ValueError, match="on_error: 'ignore'; known are record, stop"):
+        sweep([fake], range(2), tmp_path / "x", on_error="ignore")  # pyright: ignore[reportArgumentType]
+    assert not (tmp_path / "x").exists()
+
+
+def test_fresh_starts_anew_and_leaves_other_policies(tmp_path):
+    sweep(both(), range(20), tmp_path)
+    with pytest.raises(
+        ResultsError, match="'code' is '1' there and '2' here; use another directory, or start anew"
+    ):
+        sweep([FakeEpisodes(version="2")], range(10), tmp_path)
+    fake = FakeEpisodes(version="2")
+    sweep([fake], range(10), tmp_path, fresh=True)
+    assert fake.ran == list(range(10))
+    results = open_results(tmp_path)
+    assert seeds_of(results) == list(range(10)) and seeds_of(results, "hilly") == list(range(20))
+    assert results.provenance["flat", "still"]["code"] == "2"
+    with pytest.raises(ValueError, match="fresh would remove the results of other shards"):
+        sweep([fake], range(10), tmp_path, fresh=True, shard=(0, 2))
+    again = FakeEpisodes(version="2")
+    sweep([again], range(10), tmp_path / "new", fresh=True)  # there is nothing to remove
+    assert len(again.ran) == 10
+
+
+@pytest.mark.parametrize(
+    ("there", "here", "said"),
+    [
+        ({"source": "a"}, {"source": "b"}, "limsim_jax itself has changed since"),
+        (
+            {"policy_code": {"program": "a"}},
+            {"policy_code": {"program": "b"}},
+            "the program of the policy has changed",
+        ),
+        (
+            {"policy_code": {"sources": {"my.py": "a", "x.py": "c"}}},
+            {"policy_code": {"sources": {"my.py": "b", "x.py": "c"}}},
+            "the policy's code in my.py has changed since",
+        ),
+        (
+            {"policy_code": {"values": "a"}},
+            {"policy_code": {"values": "b"}},
+            "the numbers that the policy holds",
+        ),
+        ({}, {"policy_code": {"program": "a"}}, "not known with which code of the policy they were made"),
+    ],
+)
+def test_what_has_changed_is_said_in_words(there, here, said):
+    found = Entry("a", "b", here, {}).difference(there)
+    assert found is not None and said in found and "'" not in found.replace("policy's", "")
 
 
 def test_seeds_may_have_gaps_and_any_order(tmp_path):

@@ -20,8 +20,9 @@ from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import phase_at
 from limsim_jax.simulation.rollout import Rollout, world_key
+from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
-from limsim_jax.traffic.engine import Command, Traffic, decide, drive
+from limsim_jax.traffic.engine import Traffic, decide, drive
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.right_of_way import Approaches, passage, travel_time
 from limsim_jax.traffic.right_of_way.stops import stops_at_lights

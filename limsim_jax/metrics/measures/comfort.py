@@ -11,7 +11,7 @@ from limsim_jax.metrics.reductions import Measured
 from limsim_jax.metrics.step import StepView
 
 _SOURCE = "nuplan-devkit, state_extractors.py"
-_SHORT = "The episode is shorter than the filter (about two seconds for jerk)."
+_SHORT = "The ego was on the road for no full step."
 
 
 def _column(name: str, meaning: str, better: Better, formula: str, plot: Plot | None = None) -> Description:

@@ -33,14 +33,21 @@ class Progress(Measure):
         Description(
             "success", "1 if it did without any contact and without leaving the road", "Drive and rules",
             "higher", "proportion",
-            formula="arrived, contacts = 0 and never off_road; an experiment may set its own "
-            "criteria in [success].",
+            formula="arrived, contacts = 0, never off_road and no policy_failed; an experiment may set its "
+            "own criteria in [success], which an episode with policy_failed never meets.",
             headline=Headline(1, "success", unit="%", scale=100),
+        ),
+        Description(
+            "out_of_time", "1 if the ego was still on its way when the time was up", "Drive and rules",
+            "lower", "proportion",
+            formula="On the road at the horizon, without arrival, contact, departure from the road or "
+            "policy_failed.",
+            headline=Headline(2, "out of time", unit="%", scale=100, rare=True),
         ),
         Description(
             "completion", "share of the route driven", "Drive and rules", "higher",
             formula="progress / length of the route at the start, limited to 0 to 1; 1 on arrival.",
-            headline=Headline(2, "route completed", unit="%", scale=100),
+            headline=Headline(3, "route completed", unit="%", scale=100),
         ),
         Description(
             "completion_time", "s until the goal", "Drive and rules", "lower",
@@ -64,8 +71,20 @@ class Progress(Measure):
             "mean_speed", "m/s", "Drive and rules", "higher",
             formula="distance / duration.",
             missing="The ego was on the road for no full step.",
-            headline=Headline(13, "mean speed", unit="m/s"),
+            headline=Headline(14, "mean speed", unit="m/s"),
             plot=Plot("Mean speed of the ego", "m/s"),
+        ),
+        Description(
+            "policy_failed", "1 if the policy raised an exception or gave a command that is not finite",
+            "Drive and rules", "lower", "proportion",
+            formula="Status.NOT_FINITE of the ego. The episode ends there, without success and with "
+            "scores of 0; the ego brakes to a standstill.",
+            headline=Headline(0, "POLICY FAILED", unit="%", scale=100, rare=True),
+        ),
+        Description(
+            "policy_failed_time", "s, when it did", "Drive and rules",
+            formula="Time of the first step after the broken command.",
+            missing="The policy did not fail.",
         ),
     )  # fmt: skip
 
@@ -76,22 +95,28 @@ class Progress(Measure):
     def update(self, carry: ProgressCarry, step: StepView, derived: Derived) -> ProgressCarry:
         """Add the distance of this step."""
         to_go = step.record.to_go
-        return ProgressCarry(
-            to_go=jnp.stack([jnp.where(step.drove, carry.to_go[0], to_go), to_go]),
-            distance=carry.distance + step.driven,
-        )
+        first = jnp.where(step.drove, carry.to_go[0], to_go)
+        return self.advance(carry._replace(to_go=jnp.stack([first, to_go])), to_go, step.driven)
+
+    def advance(
+        self, carry: ProgressCarry, to_go: Float[Array, ""], moved: Float[Array, ""]
+    ) -> ProgressCarry:
+        """Add `moved` (m), after which there are `to_go` (m) left."""
+        return ProgressCarry(jnp.stack([carry.to_go[0], to_go]), carry.distance + moved)
 
     def result(self, carry: ProgressCarry, summary: Summary) -> dict[str, Measured]:
         """All columns."""
-        clean = (summary.contacts == 0) & ~summary.off_road
         speed = safe_divide(carry.distance, summary.duration)
         return {
             "arrived": summary.number(summary.arrived),
-            "success": summary.number(summary.arrived & clean),
+            "success": summary.number(summary.arrived & ~summary.failed),
+            "out_of_time": summary.number(summary.there & ~summary.failed),
             "completion": measured(summary.completion, summary.started),
             "completion_time": measured(summary.duration, summary.arrived),
             "duration": measured(summary.duration, summary.started),
             "distance": measured(carry.distance, summary.started),
             "progress": measured(summary.progress, summary.started),
-            "mean_speed": measured(speed, summary.driven),
+            "mean_speed": measured(speed, summary.judged),
+            "policy_failed": summary.number(summary.broken),
+            "policy_failed_time": measured(summary.now, summary.broken),
         }

@@ -51,7 +51,7 @@ class TimeToCollision(Measure):
             formula="Least of min_ttc_1d and min_ttc_2d over all steps.",
             source=_HAYWARD,
             missing=_NO_COLLISION,
-            headline=Headline(9, "least TTC, median", "median", "s"),
+            headline=Headline(10, "least TTC, median", "median", "s"),
             plot=Plot("Least TTC", "s"),
         ),
         Description(

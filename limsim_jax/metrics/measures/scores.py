@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.metrics.blame import ahead, behind
 from limsim_jax.metrics.description import Better, Description, Headline, Kind, Plot
 from limsim_jax.metrics.measure import Derived, Measure, Summary
 from limsim_jax.metrics.reductions import Measured, measured
 from limsim_jax.metrics.scores import (
+    CARLA_RADIUS,
+    CARLA_STANDS,
     LimSimCarry,
     LimSimStep,
     Number,
@@ -26,9 +28,9 @@ from limsim_jax.metrics.scores import (
     nuplan_ttc,
 )
 from limsim_jax.metrics.step import StepView
-from limsim_jax.numerics import safe_divide
+from limsim_jax.numerics import safe_divide, safe_norm
 
-_NUPLAN_SHORT = "The episode is shorter than the filters of comfort."
+_NO_STEP = "The ego was on the road for no full step, and did not fail."
 
 
 def _nuplan(
@@ -36,7 +38,7 @@ def _nuplan(
 ) -> Description:
     return Description(
         name, meaning, "Scores", "higher", kind, formula, "nuplan-devkit, closed-loop metric aggregator",
-        _NUPLAN_SHORT, Headline(10, "nuPlan score", unit="of 1") if score else None,
+        _NO_STEP, Headline(11, "nuPlan score", unit="of 1") if score else None,
         Plot("nuPlan score", "of 1") if score else None,
     )  # fmt: skip
 
@@ -56,8 +58,7 @@ class NuPlan(Measure):
         _nuplan(
             "nuplan_score", "0 to 1",
             "Product of the multipliers times the weighted mean of progress (5), ttc (5), speed_limit (4) "
-            "and "
-            "comfort (2).",
+            "and comfort (2); 0 with policy_failed.",
             score=True,
         ),
         _nuplan(
@@ -126,9 +127,17 @@ class NuPlan(Measure):
                 comfortable=summary.comfortable.value > 0.5,
             )
         )
-        judged = summary.driven & summary.comfortable.valid
+        found = found._replace(score=jnp.where(summary.broken, 0, found.score))
         names = {name: "nuplan_score" if name == "score" else f"nuplan_{name}" for name in found._fields}
-        return {names[name]: measured(value, judged) for name, value in found._asdict().items()}
+        return {names[name]: measured(value, summary.judged) for name, value in found._asdict().items()}
+
+
+class CarlaCarry(NamedTuple):
+    """Memory of `Carla`."""
+
+    collisions: Int[Array, ""]
+    place: Float[Array, " 2"]  # m, of the ego at the last one, until it is `CARLA_RADIUS` away from there
+    near: Bool[Array, ""]  # it is not yet
 
 
 class Carla(Measure):
@@ -138,38 +147,60 @@ class Carla(Measure):
     columns = (
         Description(
             "carla_score", "0 to 100", "Scores", "higher",
-            formula="100 x completion x carla_penalty.",
+            formula="100 x completion x carla_penalty; 0 with policy_failed.",
             source="CARLA leaderboard 2.0, statistics_manager.py",
-            missing="The ego was on the road for no full step.",
-            headline=Headline(11, "CARLA score", unit="of 100"),
+            missing=_NO_STEP,
+            headline=Headline(12, "CARLA score", unit="of 100"),
             plot=Plot("CARLA driving score", "of 100"),
         ),
         Description(
             "carla_penalty", "0 to 1", "Scores", "higher",
-            formula="0.6 for each contact, 0.7 for each red light, 0.8 for each stop sign, times 1 - "
-            "off_route.",
+            formula="0.6 for each of carla_collisions, 0.7 for each red light, 0.8 for each stop sign, times "
+            "1 - off_route.",
             source="CARLA leaderboard 2.0, statistics_manager.py",
-            missing="The ego was on the road for no full step.",
+            missing=_NO_STEP,
+        ),
+        Description(
+            "carla_collisions", "contacts by CARLA's criterion", "Scores", "lower",
+            formula="New contacts while the ego drives 0.1 m/s or more; those within 5 m of the last one "
+            "count once, until the ego has been farther away.",
+            source="CARLA scenario_runner, CollisionTest in atomic_criteria.py",
         ),
     )  # fmt: skip
 
-    def result(self, carry: tuple[()], summary: Summary) -> dict[str, Measured]:
-        """Both columns."""
+    def init(self, slots: int, zones: int) -> CarlaCarry:
+        """No collision."""
+        return CarlaCarry(jnp.zeros((), jnp.int32), jnp.zeros(2), jnp.zeros((), bool))
+
+    def update(self, carry: CarlaCarry, step: StepView, derived: Derived) -> CarlaCarry:
+        """Count a collision that is new."""
+        here = step.ego_box[:2]
+        near = carry.near & (safe_norm(here - carry.place) <= CARLA_RADIUS)
+        counts = derived.hit & ~near & (step.ego_speed >= CARLA_STANDS)
+        return CarlaCarry(
+            collisions=carry.collisions + counts.astype(jnp.int32),
+            place=jnp.where(counts, here, carry.place),
+            near=near | counts,
+        )
+
+    def result(self, carry: CarlaCarry, summary: Summary) -> dict[str, Measured]:
+        """All columns."""
         counts: dict[str, Number] = {
-            "vehicles": summary.contacts,
+            "vehicles": carry.collisions,
             "red_lights": summary.red_lights,
             "stop_signs": summary.stop_signs,
         }
         outside = safe_divide(summary.off_route, summary.distance)
         found = carla_score(summary.completion, counts, outside=outside)
         return {
-            "carla_score": measured(found.score, summary.driven),
-            "carla_penalty": measured(found.penalty, summary.driven),
+            "carla_score": measured(jnp.where(summary.broken, 0, found.score), summary.judged),
+            "carla_penalty": measured(found.penalty, summary.judged),
+            "carla_collisions": summary.number(carry.collisions),
         }
 
 
 _LIMSIM = "LimSim++, arXiv 2402.01246 and its released code; the driving score of arXiv 2502.09170"
-_NO_SECOND = "The episode has no full second; of the corrected version, it is shorter than the filters."
+_NO_SECOND = "The episode has no full second, and the ego did not fail: an ego that failed has 0."
 _PARTS: dict[str, tuple[str, str]] = {
     "total": ("0 to 100, drive score times completion", "limsim_{version}_drive x completion."),
     "drive": (
@@ -192,7 +223,7 @@ def _limsim(version: str) -> list[Description]:
             Description(
                 f"limsim_{version}_{part}", meaning, "Scores", "higher", "mean",
                 formula.format(version=version),
-                _LIMSIM, _NO_SECOND, Headline(12, "LimSim score, corrected", unit="of 100") if main else None,
+                _LIMSIM, _NO_SECOND, Headline(13, "LimSim score, corrected", unit="of 100") if main else None,
                 Plot("LimSim score, corrected", "of 100") if main else None,
             )
         )  # fmt: skip
@@ -200,9 +231,7 @@ def _limsim(version: str) -> list[Description]:
 
 
 def _second(name: str, meaning: str, better: Better, formula: str) -> Description:
-    return Description(
-        name, meaning, "Scores", better, "mean", formula, _LIMSIM, "The episode has no full second."
-    )
+    return Description(name, meaning, "Scores", better, "mean", formula, _LIMSIM, _NO_SECOND)
 
 
 @dataclass(frozen=True)
@@ -262,9 +291,17 @@ class LimSim(Measure):
             "faithful": limsim_faithful(carry, success=arrived, completion=completion),
             "corrected": limsim_corrected(carry, summary.rest, failed=failed, completion=completion),
         }
-        results = {
-            f"limsim_{version}_{part}": measured(getattr(score, part), score.valid)
-            for version, score in found.items()
-            for part in _PARTS
+        # an ego that fails before its first second is over has earned nothing
+        early = summary.started & summary.failed & ~carry.worst.found
+        results: dict[str, Measured] = {}
+        for version, score in found.items():
+            for part in _PARTS:
+                none = early | (summary.broken & (part in ("total", "drive")))
+                earned: Any = jnp.where(none, 0, getattr(score, part))
+                results[f"limsim_{version}_{part}"] = measured(earned, score.valid | none)
+        worst, when = carry.worst.result(), carry.worst.when()
+        at: Any = jnp.where(early, summary.now, when.value)
+        return results | {
+            "worst_second": measured(worst.value, worst.valid | early),
+            "worst_second_time": measured(at, when.valid | early),
         }
-        return results | {"worst_second": carry.worst.result(), "worst_second_time": carry.worst.when()}

@@ -21,8 +21,9 @@ from limsim_jax.policies.predict import Prediction, Predictor, along_route, shar
 from limsim_jax.policies.reference import ReferencePath, beside, center_lane, motion_on, path_from
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.traffic.car_following import NO_GAP
+from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Trajectory, at_slots
-from limsim_jax.traffic.engine import Command, Decision, Traffic
+from limsim_jax.traffic.engine import Decision, Traffic
 from limsim_jax.traffic.lane_change import urgency
 from limsim_jax.traffic.parameters import LANE_CHANGES
 from limsim_jax.types import Config, State

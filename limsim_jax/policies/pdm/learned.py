@@ -28,8 +28,8 @@ from limsim_jax.policies.base import Policy
 from limsim_jax.policies.pdm.policy import PDMClosed, Plan
 from limsim_jax.policies.pdm.road import DT, STEPS, bodies, road_ahead
 from limsim_jax.policies.reference import to_cartesian
+from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Trajectory
-from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, State
 
 POSES, POSE_TIME = 16, 0.5

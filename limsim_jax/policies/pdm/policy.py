@@ -19,8 +19,8 @@ from limsim_jax.policies.pdm.tracker import STOPPING_SPEED, drive_along, fitted
 from limsim_jax.policies.predict import Predictor, constant_velocity
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.standards import COMFORT
+from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Trajectory
-from limsim_jax.traffic.engine import Command
 from limsim_jax.types import Config, State
 from limsim_jax.xla import computed_once
 

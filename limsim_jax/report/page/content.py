@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from limsim_jax.metrics.moments import ORDER, RESPONSIBLE, value_text, words
 from limsim_jax.report.formats import number
-from limsim_jax.report.tables import Group, columns, metrics_of, worst
+from limsim_jax.report.tables import CAUSES, Group, causes, columns, failed_policies, metrics_of, worst
 from limsim_jax.statistics import zero_event_bound
 
 if TYPE_CHECKING:
@@ -95,7 +95,9 @@ def worst_crash(results: Results) -> dict[str, Any] | None:
 
 def notable(row: Mapping[str, Any]) -> bool:
     """Whether a row of `tables.worst` is worth a line: something went wrong, or nearly did."""
-    wrong = row["contact"] or row["left_road"] or row["failed"] or row["kind"] is not None
+    wrong = (
+        row["policy_failed"] or row["contact"] or row["left_road"] or row["failed"] or row["kind"] is not None
+    )
     return wrong or (row["min_ttc"] is not None and row["min_ttc"] < NOTABLE_TTC)
 
 
@@ -107,8 +109,8 @@ def verdict(
 ) -> dict[str, Any]:
     """Success, contacts, the worst crash, demand that found no room.
 
-    `mood` is "good" where nearly all episodes succeed without a contact, "bad" where the ego is at fault or
-    most episodes fail, and "mixed" otherwise.
+    `mood` is "good" where nearly all episodes succeed without a contact, "bad" where the policy failed, the
+    ego is at fault or most episodes are without success, and "mixed" otherwise.
     """
     episodes = sum(part.num_rows for part in parts.values())
     distance = sum(_total(part, "distance") for part in parts.values()) / 1000
@@ -126,7 +128,8 @@ def verdict(
     successes = _successes(parts, names)
     least = min((share for _, share in successes), default=math.nan)
     mood = "mixed"
-    if faults or least < _BAD:
+    broken = failed_policies(results, parts)
+    if faults or broken or least < _BAD:
         mood = "bad"
     elif not contacts and least >= _GOOD:
         mood = "good"
@@ -140,6 +143,7 @@ def verdict(
     bound = number(100 * zero_event_bound(episodes, level), 2)
     return {
         "mood": mood,
+        "broken": [failure.text for failure in broken],
         "about": ", ".join(about),
         "successes": [(name, _percent(share)) for name, share in successes],
         "episodes": count(episodes, "episode"),
@@ -244,12 +248,14 @@ def what(row: Mapping[str, Any]) -> dict[str, str]:
         text += f" with vehicle {row['other']}"
     if row["time"] is not None:
         text += f" at {row['time']:.1f} s"
+    if row["reason"]:
+        text += f": {row['reason']}"
     value = ""
     if row["contact"] and row["delta_v"] is not None:
         value = f"delta-v {row['delta_v']:.1f} m/s"
     elif row["value"] is not None:
         value = value_text(kind, row["value"])
-    if not value and not row["contact"] and row["min_ttc"] is not None:
+    if not value and not row["contact"] and not row["reason"] and row["min_ttc"] is not None:
         text += f", least TTC {row['min_ttc']:.2f} s"
     after = ""
     if row["contact"] and row["at_fault"] and row["responsible"] == "other":
@@ -302,6 +308,31 @@ def worst_row(row: Mapping[str, Any], replay: str | None, names: Names) -> dict[
         "at_fault": row["at_fault"],
         "module": row["module"] or "",
     }
+
+
+# --- why episodes fail
+
+FIRST = 6
+"""Seeds of a cause that a page names."""
+
+
+def failures(parts: Mapping[Group, pa.Table], replays: Mapping[Key, str]) -> list[dict[str, Any]]:
+    """Episodes without success by cause: number, share, and the first seeds with their replays."""
+    found = {group: causes(part) for group, part in parts.items()}
+    rows = []
+    for name, text in CAUSES.items():
+        cells = []
+        for group, part in parts.items():
+            which = np.flatnonzero(found[group] == name)
+            seeds = list(dict.fromkeys(part["seed"].take(which).to_pylist()))
+            # those with a replay first
+            seeds.sort(key=lambda seed: (*group, seed) not in replays)
+            share = f"{number(100 * which.size / part.num_rows, 2)} %" if which.size else ""
+            links = [(seed, replays.get((*group, seed))) for seed in seeds[:FIRST]]
+            cells.append({"number": f"{which.size:,}", "share": share, "seeds": links})
+        if any(cell["seeds"] for cell in cells):
+            rows.append({"label": text, "cells": cells})
+    return rows
 
 
 # --- key moments

@@ -5,7 +5,7 @@ In this order:
 1. what happened, and the worst crash;
 2. the main metrics with intervals;
 3. the worst seeds, each with pictures of its key moment, the responsible party, and its replay;
-4. key moments by kind;
+4. episodes without success by cause, key moments by kind;
 5. metrics by scenario, where there are several columns;
 6. distributions, all metrics, provenance.
 
@@ -36,6 +36,7 @@ from limsim_jax.report.page.content import (
     Key,
     Names,
     card,
+    failures,
     file_name,
     key_of,
     moments,
@@ -115,6 +116,7 @@ def write_report(
         main=_main(parts, found),
         cards=cards,
         listed=[worst_row(row, replays.get(key_of(row)), names) for row in listed],
+        failures=failures(parts, replays),
         command=names.command(("SCENARIO", "POLICY"), "N"),
         moments=moments(results, parts),
         parties=responsible_counts(results, parts, names),

@@ -31,7 +31,7 @@ from limsim_jax.report.templates import read, render
 from limsim_jax.report.viewer.pack import Pack, held, origin
 from limsim_jax.report.viewer.roads import add_map
 from limsim_jax.report.viewer.traffic import add_driven, add_traffic
-from limsim_jax.simulation.ending import ending, shown_steps, without_arrived
+from limsim_jax.simulation.ending import ending, shown_steps
 from limsim_jax.simulation.trace import Trace
 from limsim_jax.types import Status
 
@@ -39,8 +39,8 @@ SUFFIXES = (".html", ".htm")
 
 MOMENT_COLORS = {
     "contact": "#d7191c", "off_road": "#8c510a", "red_light": "#c2185b", "near_miss": "#e66100",
-    "hard_brake": "#b8860b", "unsafe": "#7b3fa0", "score_drop": "#2b7bba", "arrived": "#138a5e",
-    "other": "#6b7683",
+    "hard_brake": "#b8860b", "unsafe": "#7b3fa0", "score_drop": "#2b7bba", "policy_failed": "#000000",
+    "arrived": "#138a5e", "other": "#6b7683",
 }  # fmt: skip
 """Colours of key moments by kind; "other" is for kinds that are not known here."""
 
@@ -109,10 +109,11 @@ def write_viewer(
     rows = [_moment(row, i, time, slots) for i, row in enumerate(moments)]
     fields: Any = [None if x is None else x[:kept] for x in trace]
     end = None if ego is None else ending(Trace(*fields), ego)
-    if ego is not None and end is not None:
-        trace = trace._replace(active=without_arrived(trace, ego, end))
+    gone = None
+    if end is not None:
         if end.arrived:
-            rows.append(_moment({"kind": "arrived", "time": time[end.step]}, len(rows), time, slots))
+            gone = round(float(time[end.step + 1]), 4)  # the step in which it has left
+            rows.append(_moment({"kind": "arrived", "time": gone}, len(rows), time, slots))
         kept = shown_steps(time, end, np.array([row["time"] for row in rows]))
     chosen = np.arange(0, kept, every)
     shown: Any = jax.tree.map(lambda x: np.asarray(x)[chosen], trace)
@@ -122,7 +123,7 @@ def write_viewer(
         "title": title or network.name or Path(network.source).stem,
         "map": Path(network.source).name,
         "ego": None if ego is None else int(ego),
-        "arrived": None if end is None or not end.arrived else round(float(time[end.step]), 4),
+        "arrived": gone,
         "slots": slots,
         "steps": len(chosen),
         "moments": sorted(rows, key=lambda row: row["time"]),
