@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.metrics.catalog import DERIVED, EGO, TRAFFIC
+from limsim_jax.metrics.course import Course, OnLanes, course
 from limsim_jax.metrics.description import Description
 from limsim_jax.metrics.ego import EgoCarry, EgoMetrics
 from limsim_jax.metrics.measure import Metric, Own, check_names
@@ -117,7 +118,8 @@ class EvaluateEgo:
         if self._last >= rows:
             raise ValueError(f"ego {self._last} is measured, but the world has {rows} egos")
         first = self._record(lane_map, at_start(config, state))
-        vehicles = jnp.ones(state.lane.shape[0], bool)
+        any_ = jnp.ones(state.lane.shape[0], bool)
+        vehicles = any_, Course(meets=~any_, follows=~any_)  # no paths are known yet
 
         def begin(step: EgoStep, stopped: Bool[Array, ""], goal: Int[Array, ""]) -> EgoState:
             carry = EgoState(
@@ -149,8 +151,13 @@ class EvaluateEgo:
     ) -> MetricState:
         """Add the records since the last decision, `[decision_every, ...]`."""
         way, other = records.way[0], records.other.max(0)
-        meets = self._each(lambda slot: meets_ego(lane_map, slot, way, other), (0,))
-        relevant = meets(records.ego.slot[0])
+        flow, box = records.traffic, records.ego.box[0]
+        vehicles = OnLanes(way, flow.lane[0], flow.s[0], flow.v[0], box)
+
+        def seen(slot: Int[Array, ""]) -> tuple[Bool[Array, " N"], Course]:
+            return meets_ego(lane_map, slot, way, other), course(lane_map, slot, vehicles)
+
+        relevant = self._each(seen, (0,))(records.ego.slot[0])
         _, traffic = self._metrics(config)
 
         def one(carry: MetricState, record: StepRecord) -> tuple[MetricState, None]:
@@ -215,7 +222,7 @@ class EvaluateEgo:
         stopped: Bool[Array, ""],
         goal: Int[Array, ""],
         flow: TrafficStep,
-        relevant: Bool[Array, " N"],
+        relevant: tuple[Bool[Array, " N"], Course],
     ) -> EgoState:
         """One step of one ego: its route and arrival, then its metrics."""
         ego, _ = self._metrics(config)
@@ -227,8 +234,11 @@ class EvaluateEgo:
         reached = step.arrived & routes.is_goal[lane, carry.goal]
         to_go = jnp.where(on_route, routes.distance[lane, carry.goal] - s, carry.to_go)
         to_go = jnp.where(leaves | reached, 0, to_go)
+        meets, how = relevant
         step = step._replace(
-            relevant=relevant,
+            relevant=meets,
+            course=how.meets,
+            follows=how.follows,
             to_go=to_go,
             on_route=on_route,
             arrived=leaves | reached,

@@ -109,6 +109,8 @@ def ego_step(
         active=seen,
         b_max=state.driver.b_max,
         relevant=seen,
+        course=seen,
+        follows=jnp.zeros_like(seen),
         changing=(state.side != 0) | straddles | snapshot.off_road,
         violation=signals.violation,
         slot=slot,

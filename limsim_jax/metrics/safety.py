@@ -35,6 +35,9 @@ FORESIGHT = 1000.0
 NEAR_MISS = (1.5, 2.0)
 """s: a near miss begins when the TTC falls below the first and ends when it exceeds the second."""
 
+FIRM_BRAKING = 3.4
+"""m/s^2: comfortable for most drivers (AASHTO, Green Book, stopping sight distance); harder is firm."""
+
 EXPOSED = 3.0
 """s: the usual threshold of the time exposed to a short TTC (Minderhoud and Bovy 2001)."""
 

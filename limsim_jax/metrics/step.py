@@ -10,14 +10,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.metrics.course import COURSE
 from limsim_jax.metrics.safety import (
+    FIRM_BRAKING,
     NO_GAP,
     NONE,
     Encounter,
     Zones,
     contact_interval,
+    drac,
     encounter,
     first_touch,
+    reach,
     ttc_1d,
 )
 from limsim_jax.numerics import safe_norm
@@ -33,6 +37,8 @@ class EgoStep(NamedTuple):
     active: Bool[Array, " N"]  # on the road, and on the level of the ego
     b_max: Float[Array, " N"]  # m/s^2, hardest braking
     relevant: Bool[Array, " N"]  # their path may meet the ego's: not those that keep to another lane
+    course: Bool[Array, " N"]  # along their paths they meet the ego, see `course.COURSE`
+    follows: Bool[Array, " N"]  # they drive behind the ego on its path
     changing: Bool[Array, " N"]  # in several lanes, or off the drivable area
     violation: Bool[Array, " N"]  # drives where another one has priority: red light, wrong way, right of way
     slot: Int[Array, ""]  # of the ego
@@ -212,19 +218,40 @@ class StepView:
         return jnp.where(apart, ttc_1d(self.gap, self.v, self.v_leader), NONE)
 
     @cached_property
-    def least_ttc_2d(self) -> Float[Array, ""]:
-        """Least time to collision of boxes that keep their velocities, s; `NONE` for none.
+    def ttc_on_course(self) -> Float[Array, " N"]:
+        """Time to collision of boxes that keep their velocities, s; `NONE` for none.
 
-        A vehicle counts if its path may meet that of the ego, if it touches the ego, or if the ego leaves
-        its lane.
+        A vehicle counts if it touches the ego, or if all of these hold:
+
+        - its path may meet that of the ego, or the ego leaves its lane;
+        - both also meet if they follow their lanes (up to `COURSE` s), or they drive in one direction and one
+          of them leaves its lane;
+        - it does not close up calmly behind the ego: it would have to brake harder than `FIRM_BRAKING`.
         """
-        meets = self.record.relevant | self.record.changing[self.slot] | self.touches
-        return jnp.min(jnp.where(self.apart & meets, self.ttc, NONE))
+        record, e = self.record, self.encounter
+        leaving = record.changing[self.slot]
+        beside = (leaving | record.changing) & (e.cos > 0)
+        course = record.course | beside | (self.ttc >= COURSE)
+        behind = jnp.maximum(-e.x - reach(e)[0], 0)  # m, of the other's front to the ego's tail
+        calm = record.follows & (drac(behind, e.u, jnp.zeros_like(e.u)) <= FIRM_BRAKING)
+        counts = ((record.relevant | leaving) & course & ~calm) | self.touches
+        return jnp.where(self.apart & counts, self.ttc, NONE)
+
+    @cached_property
+    def least_ttc_2d(self) -> Float[Array, ""]:
+        """Least of `ttc_on_course`, s; `NONE` for none."""
+        return jnp.min(self.ttc_on_course)
 
     @cached_property
     def least_ttc(self) -> Float[Array, ""]:
         """The lesser of both, s."""
         return jnp.minimum(self.least_ttc_2d, self.least_ttc_1d)
+
+    @cached_property
+    def least_ttc_other(self) -> Int[Array, ""]:
+        """Slot of the vehicle with that time."""
+        other = jnp.argmin(self.ttc_on_course).astype(self.leader.dtype)
+        return jnp.where(self.least_ttc_1d < self.least_ttc_2d, self.leader, other)
 
     # --- for metrics of one's own
 

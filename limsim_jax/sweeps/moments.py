@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.metrics.blame import Responsibility
 from limsim_jax.metrics.moments import ORDER
-from limsim_jax.metrics.safety import NEAR_MISS
-
-HARD = 3.4
-"""m/s^2 of braking asked for by the leader (DRAC) from which it is a key moment."""
+from limsim_jax.metrics.safety import FIRM_BRAKING, NEAR_MISS
 
 LEAD_UP = 1.0
 """s around a contact within which near misses and hard braking belong to it."""
@@ -62,8 +59,8 @@ def key_moments(
         "contact": (m["contact_time"], m["contact_delta_v"], m["contact_other"], m["contact_time"] >= 0),
         "off_road": (m["off_road_time"], m["off_road"], nobody, m["off_road_time"] >= 0),
         "red_light": (m["red_light_time"], m["red_lights"], nobody, m["red_light_time"] >= 0),
-        "near_miss": (m["min_ttc_time"], m["min_ttc"], nobody, m["min_ttc"] < NEAR_MISS[0]),
-        "hard_brake": (m["max_drac_time"], m["max_drac"], nobody, m["max_drac"] > HARD),
+        "near_miss": (m["min_ttc_time"], m["min_ttc"], m["min_ttc_other"], m["min_ttc"] < NEAR_MISS[0]),
+        "hard_brake": (m["max_drac_time"], m["max_drac"], m["max_drac_other"], m["max_drac"] > FIRM_BRAKING),
         "unsafe": (m["rss_first_time"], nobody, nobody, m["rss_first_time"] >= 0),
         "score_drop": (m["worst_second_time"], m["worst_second"], nobody, m["worst_second"] < SCORE_DROP),
     }

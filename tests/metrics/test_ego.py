@@ -76,7 +76,7 @@ def test_a_free_drive():
         "min_ttc", "min_ttc_time", "min_ttc_1d", "min_ttc_2d", "min_thw", "max_drac", "max_drac_time",
         "min_pet", "min_pet_time", "min_distance", "rss_first_time", "contact_time", "contact_other",
         "contact_type", "contact_at_fault", "contact_responsibility", "contact_delta_v", "max_delta_v",
-        "off_road_time", "red_light_time", "policy_failed_time",
+        "off_road_time", "red_light_time", "policy_failed_time", "min_ttc_other", "max_drac_other",
     }  # fmt: skip
     # without traffic the limit is the reference: 10 of 15 m/s
     assert found["limsim_faithful_efficiency"] == pytest.approx(10 / 15, rel=1e-4)
@@ -174,12 +174,48 @@ def test_vehicles_that_are_not_relevant_or_not_active_are_not_met():
     assert found["min_ttc"] is found["min_thw"] is found["min_distance"] is None
 
 
+def test_a_collision_course_is_one_along_the_lanes_too():
+    """Boxes on straight lines meet; paths do not."""
+    crossing = [(25.0, -25.0, np.pi / 2, 10.0)]  # where the ego is after 2.5 s
+    r = record(20, (0, 0, 0, 10.0), crossing)
+    assert measure(r)["min_ttc"] < 0.5 and measure(r)["min_ttc_other"] == 1.0
+    apart = {k: x.copy() for k, x in r.items()}
+    apart["course"][:, 1] = False
+    assert measure(apart)["min_ttc"] is None and measure(apart)["near_misses"] == 0.0
+    apart["changing"][:, 0] = True  # it comes from the side: a lane change leads nowhere near it
+    assert measure(apart)["min_ttc"] is None
+    far = record(3, (0, 0, 0, 10.0), [(100.0, -100.0, np.pi / 2, 10.0)])
+    far["course"][:, 1] = False
+    assert measure(far)["min_ttc"] > 5.0  # so far ahead paths are not followed
+    side = record(12, (0, 0, 0.0, 10.0), [(1.0, 4.0, -0.1, 10.1)])
+    side["course"][:, 1] = False
+    assert measure(side)["min_ttc"] is None
+    for who in (0, 1):  # either of them leaves its lane
+        leaves = {k: x.copy() for k, x in side.items()}
+        leaves["changing"][:, who] = True
+        assert measure(leaves)["min_ttc"] < 1.0, who
+
+
+@pytest.mark.parametrize(("speed", "way", "near"), [(4.0, 10.0, 0.0), (14.0, 10.0, 1.0), (6.0, 3.0, 1.0)])
+def test_a_vehicle_that_closes_up_calmly_behind_a_standing_ego_is_no_near_miss(speed, way, near):
+    """It brakes over `way` m and stops half a metre behind; only the first one brakes calmly."""
+    a = speed**2 / (2 * way)  # m/s^2
+    v = np.maximum(speed - a * DT * np.arange(61), 0.0)
+    stop = float(np.sum(v[1:]) * DT)
+    r = record(61, (0, 0, 0, 0.0), [(-stop - 0.5 - LENGTH, 0, 0, v)])
+    assert measure(r)["near_misses"] == 1.0
+    r["follows"][:, 1] = True
+    found = measure(r)
+    assert found["near_misses"] == near and found["contacts"] == 0.0
+
+
 def test_a_vehicle_that_touches_is_met_wherever_it_is_going():
     r = record(31, (0, 0, 0, 20.0), [(30, 0, 0, 0.0)])  # it would be through the other in half a second
     assert measure(r)["contacts"] == 1.0
-    r["relevant"][:, 1] = False
+    for name, value in (("relevant", False), ("course", False), ("follows", True)):
+        r[name][:, 1] = value
     found = measure(r)
-    assert found["contacts"] == 1.0 and found["min_ttc"] == 0.0
+    assert found["contacts"] == 1.0 and found["min_ttc"] == 0.0 and found["min_ttc_other"] == 1.0
     assert found["min_ttc_time"] == found["contact_time"]
 
 
@@ -556,18 +592,20 @@ def test_slots_do_not_matter():
     orders = [rng.permutation(12) for _ in records]
     a = on_host(many(stack(records)))
     b = on_host(many(stack([shuffled(r, order) for r, order in zip(records, orders, strict=True)])))
-    others = a.pop("contact_other"), b.pop("contact_other")
+    slots = ("contact_other", "min_ttc_other", "max_drac_other")
+    others = {name: (a.pop(name), b.pop(name)) for name in slots}
     assert_same(a, b)
-    for k, order in enumerate(orders):
-        if not np.isnan(others[0][k]):
-            assert np.argsort(order)[int(others[0][k])] == int(others[1][k])
-    assert np.sum(~np.isnan(others[0])) > 3  # there are contacts
+    for name, (here, there) in others.items():
+        for k, order in enumerate(orders):
+            if not np.isnan(here[k]) and not (name == "min_ttc_other" and a["min_ttc"][k] == 0):  # of several
+                assert np.argsort(order)[int(here[k])] == int(there[k]), name
+        assert np.sum(~np.isnan(here)) > 3, name
     assert np.nanmin(a["min_pet"]) < 1 and np.nanmax(a["contacts"]) > 1
     empty = shuffled(records[4], np.array([*range(9, 12), *range(9)]))
     alone = random_record(4)
     assert_same(
-        on_host(one(as_steps(alone))[0]) | {"contact_other": 0},
-        on_host(one(as_steps(empty))[0]) | {"contact_other": 0},
+        on_host(one(as_steps(alone))[0]) | dict.fromkeys(slots, 0),
+        on_host(one(as_steps(empty))[0]) | dict.fromkeys(slots, 0),
     )
 
 

@@ -92,7 +92,8 @@ def test_labels_are_not_averaged():
     rows = rows_of(made({ONE: {"contact_other": [3, 8], "contact_type": [1, 5], "contacts": [1, 1]}}))
     assert not {"contact_other", "contact_type", "seed", "digest"} & set(rows)
     labels = {name for name, meaning in UNITS.items() if describe(name, meaning).kind == "label"}
-    assert labels == {"contact_other", "contact_type", "contact_responsibility"}
+    slots = {"contact_other", "min_ttc_other", "max_drac_other"}
+    assert labels == slots | {"contact_type", "contact_responsibility"}
 
 
 def test_neither_the_order_of_rows_nor_other_scenarios_change_a_number():

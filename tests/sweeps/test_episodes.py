@@ -198,7 +198,8 @@ def rows(**columns):
     """Two worlds in which nothing is measured but what is told."""
     names = (
         "contact_time contact_delta_v contact_other contact_responsibility off_road_time off_road "
-        "red_light_time red_lights min_ttc_time min_ttc max_drac_time max_drac rss_first_time "
+        "red_light_time red_lights min_ttc_time min_ttc min_ttc_other max_drac_time max_drac "
+        "max_drac_other rss_first_time policy_failed policy_failed_time "
         "worst_second_time worst_second"
     ).split()
     nothing = {name: np.array([np.nan, np.nan]) for name in names}
@@ -213,7 +214,8 @@ def test_key_moments_are_ranked():
         rows(
             contact_time=[nan, 12.0], contact_delta_v=[nan, 6.5], contact_other=[nan, 4],
             contact_responsibility=[nan, 1], min_ttc_time=[3.0, 11.9], min_ttc=[1.2, 0.0],
-            max_drac_time=[5.0, 4.0], max_drac=[3.3, 4.4], rss_first_time=[2.0, nan],
+            max_drac_time=[5.0, 4.0], max_drac=[3.3, 4.4], max_drac_other=[2, 3], min_ttc_other=[6, 4],
+            rss_first_time=[2.0, nan],
             off_road_time=[nan, 13.0], off_road=[0, 0.1],
             worst_second_time=[8.0, 9.0], worst_second=[50.0, 49.5],
             policy_failed=[1.0, 0.0], policy_failed_time=[9.5, nan],
@@ -231,6 +233,7 @@ def test_key_moments_are_ranked():
         (9, 4, "score_drop", 9.0),
     ]
     assert found["responsible"].tolist() == [None, None, None, "ego", None, None, None]
+    assert found["other"].tolist()[1] == 6 and found["other"].tolist()[5] == 3
     assert found["other"].tolist()[3] == 4 and found["value"].tolist()[3] == 6.5
     assert found["reason"].tolist() == ["a command that is not finite", *[None] * 6]
 

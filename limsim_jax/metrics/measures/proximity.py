@@ -33,6 +33,7 @@ class TtcCarry(NamedTuple):
     """Memory of `TimeToCollision`."""
 
     both: Least
+    other: Int[Array, ""]  # slot
     lane: Least
     boxes: Least
     exposed: Float[Array, ""]  # s
@@ -60,6 +61,11 @@ class TimeToCollision(Measure):
             missing=_NO_COLLISION,
         ),
         Description(
+            "min_ttc_other", "slot of the vehicle with min_ttc", "Safety", kind="label",
+            formula="At min_ttc_time.",
+            missing=_NO_COLLISION,
+        ),
+        Description(
             "min_ttc_1d", "s, least TTC with the leader on the lane", "Safety", "higher",
             formula="gap / (v - v of the leader) where the ego is faster.",
             source=_HAYWARD,
@@ -67,9 +73,9 @@ class TimeToCollision(Measure):
         ),
         Description(
             "min_ttc_2d", "s, least TTC of boxes that keep their velocity", "Safety", "higher",
-            formula="First time at which the boxes overlap, by the separating axes of moving boxes; of "
-            "vehicles "
-            "whose path may meet that of the ego, or of all while the ego leaves its lane.",
+            formula="First time at which the boxes overlap, by the separating axes of moving boxes. It "
+            "counts if both also meet along their lanes within 5 s, or if one of them leaves its lane; of a "
+            "follower, if it would have to brake harder than 3.4 m/s^2.",
             source=_HAYWARD,
             missing=_NO_COLLISION,
         ),
@@ -89,7 +95,9 @@ class TimeToCollision(Measure):
     def init(self, slots: int, zones: int) -> TtcCarry:
         """Nothing met."""
         empty, no = Least.empty(), jnp.zeros((), bool)
-        return TtcCarry(empty, empty, empty, jnp.zeros(()), Episodes.empty(), no, jnp.zeros((), jnp.int32))
+        return TtcCarry(
+            empty, jnp.int32(-1), empty, empty, jnp.zeros(()), Episodes.empty(), no, jnp.zeros((), jnp.int32)
+        )
 
     def update(self, carry: TtcCarry, step: StepView, derived: Derived) -> TtcCarry:
         """Add the times to collision of this step."""
@@ -97,8 +105,10 @@ class TimeToCollision(Measure):
         near = carry.near.add(least < NEAR_MISS[0], least > NEAR_MISS[1])
         near_contact = near.inside & (carry.near_contact | derived.hit)
         begun = (near_contact & ~carry.near_contact).astype(jnp.int32)
+        both = carry.both.add(least, t, least < NONE)
         return TtcCarry(
-            both=carry.both.add(least, t, least < NONE),
+            both=both,
+            other=jnp.where(_new(carry.both, both), step.least_ttc_other, carry.other),
             lane=carry.lane.add(step.least_ttc_1d, t, step.least_ttc_1d < NONE),
             boxes=carry.boxes.add(step.least_ttc_2d, t, step.least_ttc_2d < NONE),
             exposed=carry.exposed + jnp.where(step.drove & (least < EXPOSED), step.dt, 0),
@@ -112,6 +122,7 @@ class TimeToCollision(Measure):
         return {
             "min_ttc": carry.both.result(),
             "min_ttc_time": carry.both.when(),
+            "min_ttc_other": measured(carry.other.astype(summary.duration.dtype), carry.both.found),
             "min_ttc_1d": carry.lane.result(),
             "min_ttc_2d": carry.boxes.result(),
             "ttc_exposed": measured(carry.exposed, summary.started),
@@ -119,11 +130,17 @@ class TimeToCollision(Measure):
         }
 
 
+def _new(before: Least, after: Least) -> Bool[Array, ""]:
+    """Whether a step has brought a new least value."""
+    return after.found & (~before.found | (after.value < before.value))
+
+
 class FollowingCarry(NamedTuple):
     """Memory of `Following`."""
 
     thw: Least
     drac: Least  # of the negative
+    other: Int[Array, ""]  # slot of that leader
 
 
 class Following(Measure):
@@ -150,18 +167,25 @@ class Following(Measure):
             formula="Time of the first step with the value of max_drac.",
             missing=_NO_LEADER,
         ),
+        Description(
+            "max_drac_other", "slot of that leader", "Safety", kind="label",
+            formula="At max_drac_time.",
+            missing=_NO_LEADER,
+        ),
     )  # fmt: skip
 
     def init(self, slots: int, zones: int) -> FollowingCarry:
         """No leader yet."""
-        return FollowingCarry(Least.empty(), Least.empty())
+        return FollowingCarry(Least.empty(), Least.empty(), jnp.int32(-1))
 
     def update(self, carry: FollowingCarry, step: StepView, derived: Derived) -> FollowingCarry:
         """Add headway and braking of this step."""
         t, thw = step.time, time_headway(step.gap, step.v)
+        hardest = carry.drac.add(-drac(step.gap, step.v, step.v_leader), t, step.has_leader)
         return FollowingCarry(
             thw=carry.thw.add(thw, t, thw < NONE),
-            drac=carry.drac.add(-drac(step.gap, step.v, step.v_leader), t, step.has_leader),
+            drac=hardest,
+            other=jnp.where(_new(carry.drac, hardest), step.leader, carry.other),
         )
 
     def result(self, carry: FollowingCarry, summary: Summary) -> dict[str, Measured]:
@@ -171,6 +195,7 @@ class Following(Measure):
             "min_thw": carry.thw.result(),
             "max_drac": measured(-least.value, least.valid),
             "max_drac_time": carry.drac.when(),
+            "max_drac_other": measured(carry.other.astype(summary.duration.dtype), least.valid),
         }
 
 
