@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import importlib
 import math
@@ -179,7 +180,10 @@ class Episodes:
     def _check_success(self) -> None:
         unknown = [name for name in self.experiment.success if name not in self.units]
         if unknown:
-            self._refuse(f"success.{unknown[0]}", f"no such metric; known are {', '.join(self.units)}")
+            close = difflib.get_close_matches(unknown[0], list(self.units), 3, 0.5)
+            hint = f"did you mean {' or '.join(repr(name) for name in close)}?" if close else ""
+            hint = hint or "the page of metrics lists all, such as success, contacts, mean_speed"
+            self._refuse(f"success.{unknown[0]}", f"no such metric; {hint}")
 
     def _check_room(self) -> None:
         placed = self._egos is not None and self._egos.lane is not None
