@@ -44,7 +44,7 @@ from limsim_jax.sweeps.build import (
     traffic_of,
 )
 from limsim_jax.sweeps.experiment import NO_POLICY, Bounds, ExperimentError, ExperimentFile
-from limsim_jax.sweeps.identity import describe, describe_program, is_foreign, policy_code
+from limsim_jax.sweeps.identity import describe, describe_program, is_foreign, policy_code, without_sources
 from limsim_jax.sweeps.moments import key_moments
 from limsim_jax.sweeps.reruns import CanBrake, Replay, Reruns
 from limsim_jax.sweeps.store import Outcome
@@ -240,10 +240,11 @@ class Episodes:
     def provenance(self) -> dict[str, Any]:
         """Where the rows come from."""
         device = jax.local_devices()[0]
-        drivers = self.experiment.traffic.drivers
+        drivers, policy = self.experiment.traffic.drivers, self._values["policy"]
         return {
             **({"drivers": file_hash(Path(drivers).read_bytes())} if drivers is not None else {}),
-            **{name: describe(value) for name, value in self._values.items() if value},
+            **{name: describe(value) for name, value in self._values.items() if value and name != "policy"},
+            **({"policy": without_sources(describe(policy))} if policy is not None else {}),
             **({"policy_code": self._code} if self._code else {}),
             "experiment": self.experiment.model_dump(mode="json", exclude={"map"}),
             "map": {"file": os.path.basename(self.network.source), "hash": self.network.file_hash},

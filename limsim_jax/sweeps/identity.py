@@ -19,7 +19,7 @@ import sysconfig
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import FunctionType, MethodType
+from types import FunctionType, MethodType, ModuleType
 from typing import Any
 
 import jax
@@ -62,6 +62,13 @@ def describe(value: Any, inside: frozenset[int] = frozenset()) -> Any:
     elif not isinstance(value, type | FunctionType):
         found |= {name: describe(x, inside) for name, x in sorted(getattr(value, "__dict__", {}).items())}
     return found
+
+
+def without_sources(description: Any) -> Any:
+    """A description without hashes of files: of a policy `policy_code` tells more exactly what drove."""
+    if isinstance(description, Mapping):
+        return {name: without_sources(x) for name, x in description.items() if name != "source"}
+    return [without_sources(x) for x in description] if isinstance(description, list) else description
 
 
 def describe_program(*parts: Any) -> str | None:
@@ -140,13 +147,20 @@ def _sources(policy: Any) -> dict[str, Any]:
     texts: dict[str, str] = {}
     values: list[Any] = []
     files: dict[Path, None] = {}
-    seen: set[int] = set()
+    seen: dict[int, Any] = {}  # kept, so that no other object gets the same number
 
     def visit(value: Any) -> None:
-        if id(value) in seen or isinstance(value, str | bytes | int | float | bool | None):
+        if isinstance(value, str | bytes | int | float | None):
+            values.append(repr(value))
+        if id(value) in seen or isinstance(value, str | bytes | int | float | None):
             return
-        seen.add(id(value))
-        if isinstance(value, np.ndarray | jax.Array):
+        seen[id(value)] = value
+        fields = dict(sorted(vars(value).items())) if hasattr(value, "__dict__") else {}
+        if isinstance(value, HostPolicy):
+            visit([value.function, value.observe])
+        elif type(value).__module__.startswith("limsim_jax."):  # its numbers are told by `describe`
+            visit([x for x in fields.values() if not isinstance(x, str | int | float | None)])
+        elif isinstance(value, np.ndarray | jax.Array):
             values.append(describe(value))
         elif isinstance(value, Mapping):
             for x in value.values():
@@ -168,19 +182,17 @@ def _sources(policy: Any) -> dict[str, Any]:
         elif isinstance(value, FunctionType):
             visit_code(value)
             visit([cell.cell_contents for cell in value.__closure__ or ()])
-            visit([value.__defaults__, value.__kwdefaults__])
+            visit([value.__defaults__ or (), value.__kwdefaults__ or {}])
         elif isinstance(value, type):
             visit_code(value)
-        else:
+        elif not isinstance(value, ModuleType):
             visit_code(type(value))
-            fields = vars(value) if hasattr(value, "__dict__") else {}
-            skipped = {"failures"} if isinstance(value, HostPolicy) else set()
-            visit({name: x for name, x in sorted(fields.items()) if name not in skipped})
+            if _is_typed(type(value)) or _is_own(_file_of(type(value))):  # not an object of some library
+                visit(fields)
 
     def visit_code(kind: Any) -> None:
-        module = sys.modules.get(kind.__module__)
-        path = Path(getattr(module, "__file__", None) or "")
-        if kind.__module__ == "__main__" or module is None:
+        module, path = sys.modules.get(kind.__module__), _file_of(kind)
+        if _is_typed(kind):
             try:
                 text = textwrap.dedent(inspect.getsource(kind))
             except (TypeError, OSError):
@@ -203,6 +215,15 @@ def _sources(policy: Any) -> dict[str, Any]:
     names = [file.name for file in files]
     found |= {str(x): _hash(x.read_bytes()) for x in files if names.count(x.name) > 1}
     return {"sources": found | texts, **({"values": _hash(json.dumps(values).encode())} if values else {})}
+
+
+def _is_typed(kind: Any) -> bool:
+    """Whether a class or function was typed into a notebook, or into the script that runs."""
+    return kind.__module__ == "__main__" or kind.__module__ not in sys.modules
+
+
+def _file_of(kind: Any) -> Path:
+    return Path(getattr(sys.modules.get(kind.__module__), "__file__", None) or "")
 
 
 def _imports(path: Path, package: str) -> list[Path]:

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import importlib
+import logging
 import sys
 import textwrap
 from typing import Any
@@ -15,7 +16,7 @@ import pytest
 from limsim_jax.policies.base import LikeTraffic, Policy, named
 from limsim_jax.policies.host import HostPolicy
 from limsim_jax.policies.pdm import PDMClosed
-from limsim_jax.sweeps.identity import describe, is_foreign, policy_code
+from limsim_jax.sweeps.identity import describe, is_foreign, policy_code, without_sources
 
 
 @pytest.fixture
@@ -115,8 +116,24 @@ def test_numbers_that_a_planner_holds_count(package):
     def two_args(array, seen):
         return array
 
+    class Tuned:
+        def __init__(self, w):
+            self.gain, self.mode = w, "fast"
+
+        def __call__(self, seen):
+            return self.gain
+
+    def tuned(w):
+        return lambda seen: w
+
+    def by_default(w):
+        return lambda seen, w=w: w
+
     kinds = (
         Planner,
+        Tuned,
+        tuned,
+        by_default,
         lambda w: Planner(w).plan,
         closed,
         lambda w: functools.partial(two_args, np.full(3, w)),
@@ -171,6 +188,20 @@ def test_whose_code_takes_part():
     assert not is_foreign(PDMClosed()) and not is_foreign(named("mine", LikeTraffic()))
     assert is_foreign(Scaled(1.0, jnp.zeros(2)))
     assert is_foreign(HostPolicy(lambda seen: {}))
+
+
+def test_the_file_of_a_policy_does_not_count_beside_its_program():
+    described = describe(Scaled(2.0, (jnp.zeros(2), [HostPolicy(test_whose_code_takes_part)])))
+    assert "source" in str(described) and "source" not in str(without_sources(described))
+    assert without_sources(described)["factor"] == 2.0
+
+
+def test_modules_and_objects_of_libraries_are_not_walked():
+    logger, module = logging.getLogger("planner"), np
+    policy = HostPolicy(lambda seen: (logger, module, seen))
+    code = policy_code(policy)
+    logger.extra = 3.0  # pyright: ignore[reportAttributeAccessIssue]
+    assert policy_code(policy) == code and set(code["sources"]) == {"test_identity.py"}
 
 
 def test_failures_of_a_run_do_not_change_what_a_policy_is():
