@@ -50,6 +50,7 @@ TESTS = {
     "scores": ("scores", "ego"),
     "traffic": ("traffic",),
     "step": ("ego", "own_metrics"),
+    "course": ("course",),
     "measure": ("own_metrics",),
     "measures.progress": ("ego",),
     "measures.proximity": ("ego",),

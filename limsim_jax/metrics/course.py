@@ -1,8 +1,8 @@
 """Whether two vehicles are on a course to meet: both go on along their lanes, not along straight lines.
 
-A straight line through a bend leads into the oncoming lane, and one from the middle of a turn into whoever
-waits beside it. So a time to collision of boxes that keep their velocities counts only if the bodies also
-meet along their paths.
+A straight line through a bend leads into the oncoming lane, and one from the middle of a turn into a vehicle
+that waits beside it. So a time to collision of boxes that keep their velocities counts only if the bodies
+also meet along their paths.
 """
 
 from __future__ import annotations

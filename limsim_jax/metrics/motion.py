@@ -126,10 +126,11 @@ def filter_result(filter: Filter, carry: FilterCarry) -> tuple[Float[Array, "R C
 
 
 def fitted(filter: Filter, carry: FilterCarry) -> Float[Array, "M C"]:
-    """Values of one polynomial fitted to all samples so far, fewer than `M`, or of its derivative.
+    """Values of one polynomial fitted to all samples so far.
 
-    Least squares in Gram's polynomials, which are orthogonal on evenly spaced points (Abramowitz and Stegun,
-    22.17). The norms of those whose order the samples do not bear are 0.
+    Or of its derivative; the samples are fewer than `M`. Least squares in Gram's polynomials, which are
+    orthogonal on evenly spaced points (Abramowitz and Stegun, 22.17). The norms of those whose order the
+    samples do not bear are 0.
     """
     m, n = filter.window, carry.taken.astype(carry.samples.dtype)
     place = jnp.arange(m, dtype=n.dtype) - (m - n)

@@ -395,7 +395,9 @@ class _Asked(NamedTuple):
 
 
 def failure_reasons(policy: Any) -> dict[bytes, str]:
-    """Why planners within a policy failed in this process, by the random key of the decision."""
+    """Why planners within a policy failed in this process.
+
+    By the random key of the decision."""
     found: dict[bytes, str] = {}
     if isinstance(policy, HostPolicy):
         found |= policy.failures

@@ -187,7 +187,9 @@ def world_key(seed: int | Int[Array, ""]) -> Key[Array, ""]:
 
 
 def decision_key(seed: int, step: int) -> Key[Array, ""]:
-    """The key with which a policy decides in the world of a seed after so many physics steps."""
+    """The key of a policy's decision in a world.
+
+    `step`: physics steps before it."""
     return jax.random.fold_in(jax.random.split(world_key(seed))[1], step)
 
 

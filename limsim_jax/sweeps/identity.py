@@ -218,7 +218,7 @@ def _sources(policy: Any) -> dict[str, Any]:
 
 
 def _is_typed(kind: Any) -> bool:
-    """Whether a class or function was typed into a notebook, or into the script that runs."""
+    """Whether a notebook, or the script that runs, defines it."""
     return kind.__module__ == "__main__" or kind.__module__ not in sys.modules
 
 
@@ -227,7 +227,9 @@ def _file_of(kind: Any) -> Path:
 
 
 def _imports(path: Path, package: str) -> list[Path]:
-    """A file and those outside installed packages that it imports, at any depth, also within functions."""
+    """A file and the files that it imports.
+
+    At any depth, also within functions; not those of installed packages."""
     found: dict[Path, None] = {}
     waiting = [(path, package)]
     while waiting:
@@ -267,7 +269,7 @@ def _module(name: str, package: str) -> tuple[Path, str] | None:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a file belongs neither to this package nor to an installed one."""
+    """Whether a file is neither installed nor of this package."""
     if path.suffix != ".py" or not path.is_file():
         return False
     path = path.resolve()

@@ -138,7 +138,7 @@ class PolicyFailedError(ValueError):
 
 
 def _stopping(run_chunks: RunChunks) -> RunChunks:
-    """The same back end, which raises `PolicyFailedError` at the first episode in which the policy fails."""
+    """The same back end; it raises `PolicyFailedError` where the policy fails."""
 
     def run(episodes: Episodes, chunks: Iterable[Sequence[int]]) -> Iterator[Outcome]:
         for outcome in run_chunks(episodes, chunks):

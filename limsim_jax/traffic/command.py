@@ -1,4 +1,7 @@
-"""What a policy asks of its vehicles until the next decision, and what becomes of a broken command."""
+"""What a policy asks of its vehicles until the next decision.
+
+A command that is broken is found here, and its vehicle brakes.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ class Command:
 
 
 def without_broken(state: State, command: Command) -> tuple[State, Command, Bool[Array, " E"]]:
-    """Find rows that are broken, and take their numbers out of the command.
+    """Find rows that are broken, and clear them.
 
     Args:
       state: with the egos that the command is for.
@@ -70,9 +73,10 @@ def without_broken(state: State, command: Command) -> tuple[State, Command, Bool
 def hold_and_brake(
     limits: Limits, state: State, control: Control, broken: Bool[Array, " E"]
 ) -> tuple[State, Control]:
-    """The control of free egos, with those that are broken braking fully with the steering held.
+    """The control of free egos; those that are broken brake fully.
 
-    A control that is not finite, as from a trajectory of huge numbers, is broken, too.
+    Their steering is held. A control that is not finite, as from a trajectory of huge numbers, is broken
+    as well.
 
     Returns:
       The state, in which these vehicles have `Status.NOT_FINITE`, and the control.

@@ -114,7 +114,7 @@ def advance(
 
 
 def without(state: State, left: Bool[Array, " N"]) -> State:
-    """The state without vehicles that have left at the end of their goal."""
+    """The state without the vehicles that have `left`."""
     return replace(
         state,
         lane=jnp.where(left, NO_LANE, state.lane),

@@ -54,8 +54,7 @@ def ahead(lane_map, vehicles: OnLanes, k: int) -> list[np.ndarray]:
     return found
 
 
-@pytest.mark.engine
-@pytest.mark.parametrize("name", ["roundabout", "intersection"])
+@pytest.mark.parametrize("name", ["roundabout", pytest.param("intersection", marks=pytest.mark.engine)])
 def test_bodies_meet_where_a_loop_along_their_lanes_finds_it(name):
     lane_map, met, ambiguous = bundled(name)[1], 0, 0
     for seed in range(2):

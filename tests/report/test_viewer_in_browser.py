@@ -158,7 +158,10 @@ def test_the_address_leads_to_the_moment_shown(page, browser):
 
 def test_a_replay_ends_where_the_ego_arrives(world, tmp_path, browser):
     network, lane_map, trace = world
-    there = trace._replace(to_go=np.maximum(30.0 - trace.time * 10, 0.0))  # 3 s
+    to_go = np.maximum(30.0 - np.asarray(trace.time) * 10, 0.0)  # 3 s
+    active = np.array(trace.active)
+    active[to_go <= 0, SELF] = False
+    there = trace._replace(active=active, to_go=to_go)
     write_viewer(tmp_path / "a.html", network, lane_map, there, ego=SELF)
     state = browser.open(tmp_path / "a.html", "#t=99")
     assert float(state["time"]) == pytest.approx(5.0, abs=1e-3)  # 2 s more

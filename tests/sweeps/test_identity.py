@@ -55,7 +55,7 @@ def test_an_edit_of_any_module_of_a_planner_is_another_code(package):
     first = policy_code(package(planner=PLAN, gains="GAIN = 0.3\n", other="X = 1\n"))
     assert set(first["sources"]) == {"planner.py", "gains.py"} and "values" not in first
     assert policy_code(package()) == first
-    assert policy_code(package(other="X = 2\n")) == first  # nobody imports it
+    assert policy_code(package(other="X = 2\n")) == first  # no module imports it
     second = policy_code(package(gains="GAIN = 0.2\n"))
     assert second["sources"]["planner.py"] == first["sources"]["planner.py"]
     assert second["sources"]["gains.py"] != first["sources"]["gains.py"]
