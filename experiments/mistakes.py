@@ -111,17 +111,9 @@ def experiment(what: str, says: str, *changes: tuple[str, str]) -> Case:
     return Case("Experiment files", what, "sweep a.toml --seeds 4 --no-report", says, files=files)
 
 
-def policy(what: str, says: str, **changes: str) -> Case:
-    """A policy that is wrong from the start."""
-    return Case(
-        "Policies, before anything is compiled", what, "sweep a.toml --seeds 4 --no-report", says,
-        files={"a.toml": SMALL, "mine.py": mine(**changes)},
-    )  # fmt: skip
-
-
-def planner(what: str, says: str, **changes: str) -> Case:
-    """A planner on the host that is wrong from the start."""
-    files = {"a.toml": small(("mine:Mine", "mine:host")), "mine.py": mine(**changes)}
+def policy(what: str, says: str, text: str = SMALL, **changes: str) -> Case:
+    """A policy that is wrong from the start; with `HOST` a planner."""
+    files = {"a.toml": text, "mine.py": mine(**changes)}
     group = "Policies, before anything is compiled"
     return Case(group, what, "sweep a.toml --seeds 4 --no-report", says, files=files)
 
@@ -204,9 +196,11 @@ CASES = (
         r"control.steering is float32\[2\]; expected \[1 egos\]",
         found="lj.Command(control=lj.Control(acceleration=jnp.full(n, a), steering=jnp.zeros(2)))",
     ),
-    planner("a planner that returns a list", "returns list, not a mapping", body="return [1, 2]"),
-    planner("a planner with one number for all worlds", r"acceleration has shape \[\], not", body="a = 0.5"),
-    planner("a planner that raises at once", r"mine.py:\d+ in plan: ZeroDivisionError", body="1 / 0"),
+    policy("a planner that returns a list", "returns list, not a mapping", HOST, body="return [1, 2]"),
+    policy(
+        "a planner with one number for all worlds", r"acceleration has shape \[\], not", HOST, body="a = 0.5"
+    ),
+    policy("a planner that raises at once", r"mine.py:\d+ in plan: ZeroDivisionError", HOST, body="1 / 0"),
     Case(
         "Policies that break while they drive",
         "NaN from 1 s on, in JAX",

@@ -7,9 +7,8 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -36,13 +35,6 @@ JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help=
 PolicyOption = Annotated[
     str | None, typer.Option(metavar="NAME", help="Policy, where the results hold several.")
 ]
-
-
-class OnError(StrEnum):
-    """What a sweep does with an episode in which the policy fails."""
-
-    RECORD = "record"
-    STOP = "stop"
 
 
 IN_SWEEP = 6
@@ -90,9 +82,9 @@ def sweep(
         str | None, typer.Option(metavar="HOST:PORT", help="Ray cluster.  [default: this machine]")
     ] = None,
     on_error: Annotated[
-        OnError,
+        Literal["record", "stop"],
         typer.Option(help="An episode in which the policy fails is recorded as failed, or stops the sweep."),
-    ] = OnError.RECORD,
+    ] = "record",
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Remove what is there of this experiment, and start anew.")
     ] = False,
@@ -136,12 +128,12 @@ def sweep(
                 factory = functools.partial(build, experiments, chunk, cores=1)
                 summary = sweep_on_ray(
                     factory, range(seeds), folder, workers=workers, address=address, shard=part,
-                    until_ci=stop, progress=tell, on_error=on_error.value, fresh=fresh,
+                    until_ci=stop, progress=tell, on_error=on_error, fresh=fresh,
                 )  # fmt: skip
             else:
                 summary = runner.sweep(
                     made, range(seeds), folder, shard=part, until_ci=stop, progress=tell,
-                    on_error=on_error.value, fresh=fresh,
+                    on_error=on_error, fresh=fresh,
                 )  # fmt: skip
     except KeyboardInterrupt:
         print(f"stopped; {sum(kept.values())} worlds are kept in {folder}; the same command goes on")

@@ -24,6 +24,9 @@ from limsim_jax.traffic.ego import Egos, Trajectory, assign
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, State, Status
 
+PARTS = 2
+"""Policies within an `AreaOfInterest`; each decides with the key folded by its number."""
+
 _ASIDE = 0.6  # m off the middle of its lane, beyond which a vehicle is between two lanes
 
 

@@ -330,16 +330,13 @@ class HostPolicy(Policy):
 
         Worlds in which it has failed before are not shown to it again: they look like one of the others.
         """
-        size = len(asked.key)
-        alive = np.flatnonzero(asked.fine.any(-1))
-        if alive.size and alive.size < size:
-            shown = np.where(np.isin(np.arange(size), alive), np.arange(size), alive[0])
-        else:
-            shown = np.arange(size)
-        seen, memory = jax.tree.map(lambda x: x[shown], (asked.seen, asked.memory))
+        size, fine = len(asked.key), asked.fine.any(-1)
+        alive = np.flatnonzero(fine)
         found, kept = self._nothing(size, count), np.array(asked.memory)
         if not alive.size:
             return found, kept
+        shown = np.where(fine, np.arange(size), alive[0])
+        seen, memory = jax.tree.map(lambda x: x[shown], (asked.seen, asked.memory))
         try:
             answer, remembered = self._call(seen, memory, size, count)
             for name, x in answer.items():

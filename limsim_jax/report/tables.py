@@ -437,6 +437,8 @@ def _severity(table: pa.Table) -> dict[str, NDArray[Any]]:
         "delta_v": np.maximum(read("max_delta_v", 0), read("contact_delta_v", 0)) * contact,
         "left_road": (read("off_road", 0) > 0) * 1.0,
         "failed": (read("success", 1) == 0) * 1.0,
+        "out_of_time": read("out_of_time", 0),
+        "arrived": read("arrived", 0),
         "min_ttc": read("min_ttc", math.inf),
         "contact_time": read("contact_time", math.nan),
         "min_ttc_time": read("min_ttc_time", math.nan),
@@ -458,16 +460,10 @@ CAUSES: Mapping[str, str] = {
 
 def causes(part: pa.Table) -> NDArray[Any]:
     """The cause of each episode without success, of `CAUSES`; "" where there is success or it is unknown."""
-    severity = _severity(part)
-
-    def flag(name: str) -> NDArray[np.bool_]:
-        known = name in part.column_names
-        return columns(part, [name])[:, 0] > 0 if known else np.zeros(part.num_rows, bool)
-
-    found = {name: severity[name] > 0 for name in ("policy_failed", "at_fault", "contact", "left_road")}
-    found |= {"out_of_time": flag("out_of_time"), "elsewhere": ~flag("arrived"), "criteria": flag("arrived")}
-    cause = np.select(list(found.values()), list(found), "")
-    return np.where(severity["failed"] > 0, cause, "")
+    severity = {name: values > 0 for name, values in _severity(part).items()}
+    severity |= {"elsewhere": ~severity["arrived"], "criteria": severity["arrived"]}
+    cause = np.select([severity[name] for name in CAUSES], list(CAUSES), "")
+    return np.where(severity["failed"], cause, "")
 
 
 class Failure(NamedTuple):

@@ -28,6 +28,7 @@ from limsim_jax.metrics.catalog import TOTALS
 from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos, EvaluateTraffic
 from limsim_jax.metrics.reductions import on_host
+from limsim_jax.policies.area import PARTS
 from limsim_jax.policies.base import PolicyLike, check_policy, policy_name
 from limsim_jax.policies.host import failure_reasons
 from limsim_jax.simulation.ending import Watch
@@ -310,18 +311,14 @@ class Episodes:
     ) -> dict[int, str]:
         """By seed, what exceptions of a planner on the host said."""
         known = failure_reasons(self._policy)
-        if not known:
-            return {}
-        only = set(known.values()) if len(set(known.values())) == 1 else set()
         found = {}
-        for k in np.flatnonzero(metrics["policy_failed"] > 0):
-            seed, step = (
-                int(seeds[k]),
-                round(float(metrics["policy_failed_time"][k]) / self.experiment.dt) - 1,
-            )
-            key = np.asarray(jax.random.key_data(decision_key(seed, step))).tobytes()
-            reason = known.get(key) or next(iter(only), None)
-            if reason:
+        for k in np.flatnonzero(metrics["policy_failed"] > 0) if known else ():
+            seed, time = int(seeds[k]), float(metrics["policy_failed_time"][k])
+            key = decision_key(seed, round(time / self.experiment.dt) - 1)
+            parts = (jax.random.fold_in(key, part) for part in range(PARTS))
+            keys = (np.asarray(jax.random.key_data(x)).tobytes() for x in (key, *parts))
+            reason = next((known[x] for x in keys if x in known), None)
+            if reason is not None:
                 found[seed] = reason
         return found
 

@@ -1,7 +1,6 @@
 """Planners on the host: called once for all worlds, inside scan, vmap, shard_map and jit."""
 
 import dataclasses
-import functools
 import re
 import textwrap
 
@@ -9,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from traffic_worlds import bundled, no_arrivals, state_of
+from traffic_worlds import bundled, motorway, no_arrivals, state_of
 
-from limsim_jax.maps.lane_map import lane_rows, pose
+from limsim_jax.maps.lane_map import pose
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.policies import host
 from limsim_jax.policies.base import named
 from limsim_jax.policies.host import HostPolicy, Observe, failure_reasons
-from limsim_jax.simulation.rollout import Rollout
+from limsim_jax.simulation.rollout import Rollout, decision_key
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import ExperimentFile
@@ -56,22 +55,9 @@ def broken() -> HostPolicy:
     return HostPolicy(lambda seen: {"acceleration": seen.v[0], "steering": seen.v})
 
 
-@functools.cache
-def rows():
-    """Two lanes one after the other on the motorway, and a goal."""
-    network, lane_map = bundled("highway")
-    routes = lane_map.routes
-    lane = next(
-        row for row in lane_rows(network).values()
-        if int(lane_map.right[row]) == -1 and float(lane_map.length[row]) > 500
-    )  # fmt: skip
-    goal = int(np.nonzero(np.asarray(routes.reachable[lane] & (routes.lanes_to_go[lane] == 0)))[0][0])
-    return lane, goal
-
-
 def world(gap: float, v: float, free: bool = True):
     """An ego `gap` m behind a vehicle at 15 m/s."""
-    lane, goal = rows()
+    lane, goal = motorway()
     state = state_of(
         "highway", [lane] * N, [60.0, 65.0 + gap, 10.0, 10.0], [v, 15.0, 0.0, 0.0], [goal] * N,
         active=jnp.array([True, True, False, False]),
@@ -132,11 +118,11 @@ def test_the_observation_agrees_with_the_state():
     lane_map = bundled("highway")[1]
     state = world(25.0, 18.0)
     seen = jax.jit(lambda state: Observe(nearest=3, points=10)(CONFIG, lane_map, state))(state)
-    assert float(seen.v[0]) == 18.0 and float(seen.limit[0]) == float(lane_map.speed_limit[rows()[0]])
+    assert float(seen.v[0]) == 18.0 and float(seen.limit[0]) == float(lane_map.speed_limit[motorway()[0]])
     np.testing.assert_array_equal(seen.there[0], [True, False, False])
     np.testing.assert_allclose([seen.other_x[0, 0], seen.other_y[0, 0]], [30.0, 0.0], atol=0.2)
     assert float(seen.other_v[0, 0]) == 15.0 and float(seen.light_distance[0]) == host.FAR
-    lane, _ = rows()
+    lane, _ = motorway()
     x, y, heading = pose(lane_map, jnp.full(10, lane), 57.5 + 2.0 * jnp.arange(10.0))
     x0, y0, h0 = (float(np.asarray(values)[0]) for values in (x, y, heading))
     np.testing.assert_allclose(seen.way_x[0], np.cos(h0) * (x - x0) + np.sin(h0) * (y - y0), atol=1e-2)
@@ -307,6 +293,19 @@ def test_an_experiment_names_it():
     assert Episodes(experiment("follower"), chunk=2).policy == "follower"
     with pytest.raises(ValueError, match=r"acceleration has shape \[1\], not"):
         Episodes(experiment("broken"), chunk=2).run([0])
+
+
+def test_a_reason_belongs_to_its_own_world_and_decision():
+    """Of three failures at 1.1 s two have raised, one within a part of another policy."""
+    episodes = Episodes(experiment("follower"), chunk=2)
+    keys = [decision_key(4, 10), decision_key(5, 9), jax.random.fold_in(decision_key(6, 10), 1)]
+    for k, key in enumerate(keys):
+        episodes._policy.failures[np.asarray(jax.random.key_data(key)).tobytes()] = f"reason {k}"  # pyright: ignore[reportAttributeAccessIssue]
+    metrics = {"policy_failed": np.array([1.0, 1.0, 1.0, 0.0]), "policy_failed_time": np.full(4, 1.1)}
+    assert episodes._reasons(np.array([4, 5, 6, 7]), metrics) == {4: "reason 0", 6: "reason 2"}
+    episodes._policy.failures.popitem()  # pyright: ignore[reportAttributeAccessIssue]
+    episodes._policy.failures.popitem()  # pyright: ignore[reportAttributeAccessIssue]
+    assert episodes._reasons(np.array([4, 5, 6, 7]), metrics) == {4: "reason 0"}  # not that of the only one
 
 
 @pytest.mark.slow

@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from traffic_worlds import bundled, state_of
+from traffic_worlds import bundled, motorway, state_of
 
-from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.policies.pdm import PDMClosed, learned
 from limsim_jax.policies.pdm.learned import (
     BEYOND,
@@ -36,13 +35,8 @@ N = 4
 @functools.cache
 def world():
     """An ego behind another vehicle on the motorway."""
-    network, lane_map = bundled("highway")
-    routes = lane_map.routes
-    row = next(
-        row for row in lane_rows(network).values()
-        if int(lane_map.right[row]) == -1 and float(lane_map.length[row]) > 500
-    )  # fmt: skip
-    goal = int(np.nonzero(np.asarray(routes.reachable[row] & (routes.lanes_to_go[row] == 0)))[0][0])
+    lane_map = bundled("highway")[1]
+    row, goal = motorway()
     state = state_of(
         "highway", [row] * N, [60.0, 100.0, 10.0, 10.0], [20.0, 15.0, 0.0, 0.0], [goal] * N,
         active=jnp.array([True, True, False, False]),

@@ -25,6 +25,16 @@ def bundled(name: str) -> tuple[Network, LaneMap]:
     return network, build_lane_map(network)
 
 
+@functools.cache
+def motorway() -> tuple[int, int]:
+    """A long rightmost lane of the bundled motorway, and a goal without a lane change."""
+    network, lane_map = bundled("highway")
+    right, length = np.asarray(lane_map.right), np.asarray(lane_map.length)  # concrete, also while tracing
+    lane = next(row for row in lane_rows(network).values() if right[row] == -1 and length[row] > 500)
+    reachable, to_go = np.asarray(lane_map.routes.reachable), np.asarray(lane_map.routes.lanes_to_go)
+    return lane, int(np.flatnonzero(reachable[lane] & (to_go[lane] == 0))[0])
+
+
 def drivers(n: int, **changes: float) -> Driver:
     """Equal drivers."""
     values = {

@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from traffic_worlds import bundled, state_of
+from traffic_worlds import bundled, motorway, state_of
 
-from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.traffic.command import Command, without_broken
 from limsim_jax.traffic.ego import Control, Meta, Trajectory, from_lane
 from limsim_jax.traffic.engine import Traffic, drive
@@ -22,13 +21,8 @@ N = 6
 
 def world(free: bool = True, v: float = 12.0) -> State:
     """Five vehicles in a row on the motorway; egos in slots 3, 1, 0, and in 5 one that is gone."""
-    network, lane_map = bundled("highway")
-    routes = lane_map.routes
-    row = next(
-        row for row in lane_rows(network).values()
-        if int(lane_map.right[row]) == -1 and float(lane_map.length[row]) > 500
-    )  # fmt: skip
-    goal = int(np.nonzero(np.asarray(routes.reachable[row] & (routes.lanes_to_go[row] == 0)))[0][0])
+    lane_map = bundled("highway")[1]
+    row, goal = motorway()
     state = state_of(
         "highway", [row] * N, [400.0 - 60 * k for k in range(N)], [v] * N, [goal] * N,
         active=jnp.arange(N) != 5,
