@@ -15,7 +15,7 @@ from limsim_jax.geometry import wrap_angle
 from limsim_jax.log_replay.arrays import SceneArrays
 from limsim_jax.log_replay.takeover import Ego, Flight, Moment
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, to_frenet
-from limsim_jax.policies.base import PolicyLike
+from limsim_jax.policies.base import PolicyLike, sighted
 from limsim_jax.traffic.command import Command, hold_and_brake, without_broken
 from limsim_jax.traffic.ego import Control, Limits, step_free, track
 from limsim_jax.traffic.state import start_state
@@ -59,8 +59,9 @@ class PolicyPilot:
         zero = jnp.zeros_like(scene.log.x[0, 0])
         nobody = Moment(*scene_row(scene, jnp.int32(0)), jnp.zeros_like(scene.first), scene.first == 0)
         state = self._world(scene, ego, nobody, jnp.zeros_like(nobody.v), jnp.int32(0), None)
-        memory = self.policy.init(config, self.lane_map, state)
-        shapes = jax.eval_shape(self.policy, config, self.lane_map, state, memory, jax.random.key(0))
+        policy = sighted(self.policy)
+        memory = policy.init(config, self.lane_map, state)
+        shapes = jax.eval_shape(policy, config, self.lane_map, state, memory, jax.random.key(0))
         command = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes[0])
         if command.trajectory is None and command.control is None:
             raise ValueError("policy: returns neither trajectories nor controls; one of them is expected")
@@ -81,7 +82,7 @@ class PolicyPilot:
         key: Key[Array, ""] | None,
     ) -> Flight:
         """Decide if it is time, and drive one moment on."""
-        config, dt = self._config(scene), scene.log.dt
+        config, dt, driver = self._config(scene), scene.log.dt, sighted(self.policy)
         key = jax.random.key(0) if key is None else key
         memory: _Memory = flight.memory
         starts = ego.told[t] & ~flight.flying & moment.active[ego.slot]
@@ -93,9 +94,9 @@ class PolicyPilot:
 
         def decide() -> tuple[Command, Any]:
             seen = self._world(scene, ego, moment, a, t, own)
-            begin = self.policy.init(config, self.lane_map, seen)
+            begin = driver.init(config, self.lane_map, seen)
             before = jax.tree.map(lambda new, old: jnp.where(flight.flying, old, new), begin, memory.policy)
-            return self.policy(config, self.lane_map, seen, before, jax.random.fold_in(key, t))
+            return driver(config, self.lane_map, seen, before, jax.random.fold_in(key, t))
 
         command, policy = lax.cond(
             t % self.decision_every == 0, decide, lambda: (memory.command, memory.policy)

@@ -16,9 +16,10 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.base import Policy, PolicyLike, renew_rows, variants
+from limsim_jax.policies.base import Policy, PolicyLike, knows, renew_rows, seeing, sighted, variants
 from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.predict import Predictor
+from limsim_jax.policies.view import View
 from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Egos, Trajectory, assign
 from limsim_jax.traffic.motion import boxes
@@ -51,6 +52,7 @@ class AreaOfInterest(Policy):
       radius: m from the nearest ego, within which a vehicle gets a place.
       leave: m, beyond which it gives up its place; None: 1.3 times the radius.
       dwell: s that it keeps its place at least. Between two lanes it always keeps it.
+      privileged: it chooses the vehicles by the state; each planner sees by its own view.
 
     Raises:
       ValueError: a value out of range, or a planner `around` that keeps to lanes.
@@ -62,6 +64,7 @@ class AreaOfInterest(Policy):
     radius: float = 50.0
     leave: float | None = None
     dwell: float = 3.0
+    privileged: bool = field(default=True, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.slots < 1:
@@ -80,6 +83,17 @@ class AreaOfInterest(Policy):
     def free(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether the egos move in the plane; the vehicles around always do."""
         return self.ego is None or self.ego.free
+
+    @property
+    def knows(self) -> str:
+        """What the planner of the egos knows."""
+        return knows(self.around if self.ego is None else self.ego)
+
+    def seeing(self, view: View | None, privileged: bool | None) -> AreaOfInterest:
+        """The same with another view of all planners."""
+        around = seeing(self.around, view=view, privileged=privileged)
+        ego = None if self.ego is None else seeing(self.ego, view=view, privileged=privileged)
+        return replace(self, around=around, ego=ego)
 
     def variants(self, seen: Predictor) -> dict[str, PolicyLike]:
         """The variants of the egos' planner; vehicles around keep theirs."""
@@ -124,7 +138,7 @@ class AreaOfInterest(Policy):
 
     def _policies(self) -> list[Any]:
         around = _with_others(self.around, self.slots)  # its last rows are not egos
-        return [around] if self.ego is None else [self.ego, around]
+        return [sighted(policy) for policy in ([around] if self.ego is None else [self.ego, around])]
 
     def _split(self, rows: Any) -> list[Any]:
         """Arrays of all rows, split by policy."""

@@ -7,7 +7,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Key
 
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.predict import Predictor
+from limsim_jax.policies.view import View
 from limsim_jax.traffic.command import Command
 from limsim_jax.types import Config, State
 
@@ -65,9 +66,13 @@ class Policy(ABC):
 
     Attributes:
       name: of the policy in results; None: that of the class, see `policy_name`.
+      view: what it can see; drivers and routes of other vehicles are beliefs.
+      privileged: whether it gets the true state of the simulation instead of the view.
     """
 
     name: str | None = field(default=None, kw_only=True)
+    view: View = field(default_factory=View, kw_only=True)
+    privileged: bool = field(default=False, kw_only=True)
 
     free = True
     others = 0
@@ -89,7 +94,8 @@ class Policy(ABC):
         Args:
           config: steps and times of the simulation.
           lane_map: the map.
-          state: the world now. Row k of `state.egos` is the k-th ego, `state.egos.slot[k]` its vehicle.
+          state: the world now, as the planner sees it. Row k of `state.egos` is the k-th ego,
+            `state.egos.slot[k]` its vehicle.
           memory: what `init` or the call before returned.
           key: random key of this decision.
         """
@@ -113,6 +119,7 @@ class LikeTraffic(Policy):
     """The egos drive as all traffic does: car following, lane changes, right of way."""
 
     free = False
+    privileged: bool = field(default=True, kw_only=True)
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
@@ -122,36 +129,85 @@ class LikeTraffic(Policy):
         return Command(), memory
 
 
-# --- names -------------------------------------------------------------------------------------------
+# --- policies around policies ------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _Named(Policy):
-    """A policy that has no field `name`, under another name."""
+class Wrapper(Policy):
+    """A policy around another one, with its memory."""
 
     policy: PolicyLike
 
     @property
     def free(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """That of the policy."""
         return self.policy.free
 
     @property
     def others(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Those of the policy."""
         return getattr(self.policy, "others", 0)
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+        """The memory of the policy."""
         return self.policy.init(config, lane_map, state)
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
     ) -> tuple[Command, Any]:
+        """The command of the policy."""
         return self.policy(config, lane_map, state, memory, key)
 
     def memory_rows(self, memory: Any) -> Any:
+        """Those of the policy."""
         return memory_rows(self.policy, memory)
 
     def variants(self, seen: Predictor) -> dict[str, PolicyLike]:
+        """Those of the policy."""
         return variants(self.policy, seen)
+
+
+class _Sight(NamedTuple):
+    sight: Any  # memory of the view
+    policy: Any  # memory of the policy
+
+
+@dataclass(frozen=True)
+class _Sighted(Wrapper):
+    """A policy that gets its view instead of the state."""
+
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> _Sight:
+        return _Sight(self.view.init(config, state), self.policy.init(config, lane_map, state))
+
+    def __call__(
+        self, config: Config, lane_map: LaneMap, state: State, memory: _Sight, key: jax.Array
+    ) -> tuple[Command, _Sight]:
+        seen, sight = self.view.look(config, lane_map, state, memory.sight, key)
+        command, inner = self.policy(config, lane_map, seen, memory.policy, key)
+        return command, _Sight(sight, inner)
+
+    def memory_rows(self, memory: _Sight) -> Any:
+        rows = memory_rows(self.policy, memory.policy)
+        return _Sight(jax.tree.map(lambda _: False, memory.sight), rows)
+
+
+def sighted(policy: PolicyLike) -> PolicyLike:
+    """The policy as it is to be called: with its view of the world, unless it is privileged.
+
+    A policy without a `view` gets the default one.
+    """
+    if getattr(policy, "privileged", False) or isinstance(policy, _Sighted):
+        return policy
+    return _Sighted(policy, view=getattr(policy, "view", View()), privileged=True)
+
+
+def knows(policy: Any) -> str:
+    """What a policy knows of other vehicles: "state" or "view"."""
+    told = getattr(policy, "knows", None)
+    return told or ("state" if getattr(policy, "privileged", False) else "view")
+
+
+# --- names -------------------------------------------------------------------------------------------
 
 
 def policy_name(policy: Any) -> str:
@@ -185,7 +241,26 @@ def named(name: str, policy: Any) -> Any:
     _checked_name(name)
     if is_dataclass(policy) and any(f.name == "name" and f.init for f in fields(policy)):
         return replace(policy, name=name)  # pyright: ignore[reportArgumentType]
-    return _Named(policy, name=name)  # pyright: ignore[reportArgumentType]
+    return seeing(Wrapper(policy, name=name), like=policy)  # pyright: ignore[reportArgumentType]
+
+
+def seeing(policy: Any, *, view: View | None = None, privileged: bool | None = None, like: Any = None) -> Any:
+    """The same policy with another view, or with the state.
+
+    Args:
+      policy: any policy.
+      view: what it sees; None: as `like`.
+      privileged: whether it gets the state; None: as `like`.
+      like: a policy that sees the same; None: `policy` itself.
+    """
+    if like is None and callable(own := getattr(policy, "seeing", None)):
+        return own(view, privileged)
+    like = policy if like is None else like
+    view = getattr(like, "view", View()) if view is None else view
+    privileged = getattr(like, "privileged", False) if privileged is None else privileged
+    if not is_dataclass(policy) or not {"view", "privileged"} <= {f.name for f in fields(policy)}:
+        policy = Wrapper(policy, name=policy_name(policy))  # pyright: ignore[reportArgumentType]
+    return replace(policy, view=view, privileged=privileged)  # pyright: ignore[reportArgumentType]
 
 
 def snake_case(name: str) -> str:

@@ -45,11 +45,21 @@ def _by_name(policy: str | PolicyLike, options: Mapping[str, Any]) -> PolicyLike
     return build_policy(POLICIES[policy], options)
 
 
+def pdm_closed_rules(seen: int = 32) -> PDMClosed:
+    """`PDMClosed` that gives way as the map demands.
+
+    Raises:
+      ValueError: no other vehicle is seen.
+    """
+    return PDMClosed(seen=seen, rules=True)
+
+
 POLICIES: dict[str, Callable[..., PolicyLike]] = {
     "like_traffic": LikeTraffic,
     "constant_speed": ConstantSpeed,
     "follow_lane": FollowLane,
     "pdm_closed": PDMClosed,
+    "pdm_closed_rules": pdm_closed_rules,
     "pdm_hybrid": PDMHybrid,
     "limsim_tm": LimSimTM,
     "area_of_interest": area_of_interest,

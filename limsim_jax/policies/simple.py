@@ -92,6 +92,7 @@ class FollowLane(Policy):
 
     others: int = 0
     traffic: Traffic = field(default_factory=Traffic)
+    privileged: bool = field(default=True, kw_only=True)
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array

@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Int, Key
 
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.base import LikeTraffic, PolicyLike
+from limsim_jax.policies.base import LikeTraffic, PolicyLike, sighted
 from limsim_jax.simulation.totals import Stood, Totals, count, no_totals
 from limsim_jax.traffic.collision import collided
 from limsim_jax.traffic.demand import delayed
@@ -80,7 +80,7 @@ class Rollout:
       config: steps and look-ahead.
       traffic: behaviour of the others.
       horizon: s; rounded up to whole decisions.
-      policy: drives the egos.
+      policy: drives the egos, by its view of the world unless it is privileged.
       record: of every physics step, given the lane map: `trace`, or None for none.
       measure: metrics, or None.
     """
@@ -116,7 +116,7 @@ class Rollout:
         if not self._free:
             egos = replace(egos, free=jnp.zeros_like(egos.free))
         state = replace(state, egos=egos)
-        return self.restart(lane_map, state, self.policy.init(self.config, lane_map, state))
+        return self.restart(lane_map, state, sighted(self.policy).init(self.config, lane_map, state))
 
     def restart(self, lane_map: LaneMap, state: State, memory: Any) -> Carry:
         """Before a decision of a world that runs already: totals and metrics begin here."""
@@ -138,7 +138,7 @@ class Rollout:
         and has no gradient in reverse.
 
         Returns the result, and the carry to run on from there."""
-        config, measure = self.config, self.measure
+        config, measure, policy = self.config, self.measure, sighted(self.policy)
         trace = None if self.record is None else self.record(lane_map)
 
         def record(tick: Tick) -> tuple[Any, Any]:
@@ -148,7 +148,7 @@ class Rollout:
         def decide(carry: Carry, _: None) -> tuple[Carry, Any]:
             state, memory, totals, stood, measured = carry
             now = jax.random.fold_in(key, state.step)
-            command, memory = self.policy(config, lane_map, state, memory, now)
+            command, memory = policy(config, lane_map, state, memory, now)
             after, (kept, records) = drive(
                 config, self.traffic, lane_map, state, schedule, command, record, free=self._free
             )

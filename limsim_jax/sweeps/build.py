@@ -21,7 +21,8 @@ from limsim_jax.maps.network import MapError, Network
 from limsim_jax.maps.origins import origins, road_origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.policies import POLICIES
-from limsim_jax.policies.base import PolicyLike, build_policy
+from limsim_jax.policies.base import PolicyLike, build_policy, seeing
+from limsim_jax.policies.view import view_of
 from limsim_jax.sweeps.experiment import EgoTable, ExperimentError, ExperimentFile
 from limsim_jax.traffic import car_following
 from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand
@@ -68,6 +69,15 @@ def policy_of(experiment: ExperimentFile) -> PolicyLike:
         raise ExperimentError(f"{experiment.name}: ego.options: {error}") from None
     if not isinstance(getattr(policy, "free", None), bool):
         raise ExperimentError(f"{where}: '{name}' is no policy; see limsim_jax.policies.base.Policy")
+    return with_view(experiment, policy)
+
+
+def with_view(experiment: ExperimentFile, policy: PolicyLike) -> PolicyLike:
+    """The policy with the view that the file gives to its egos."""
+    for ego in experiment.ego[:1]:  # one policy drives all
+        if ego.view or ego.privileged is not None:
+            view = view_of(ego.view) if ego.view else None
+            return seeing(policy, view=view, privileged=ego.privileged)
     return policy
 
 

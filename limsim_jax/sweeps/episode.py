@@ -43,6 +43,7 @@ from limsim_jax.sweeps.build import (
     map_of,
     policy_of,
     traffic_of,
+    with_view,
 )
 from limsim_jax.sweeps.experiment import NO_POLICY, Bounds, ExperimentError, ExperimentFile
 from limsim_jax.sweeps.identity import describe, describe_program, is_foreign, policy_code, without_sources
@@ -100,7 +101,7 @@ class Episodes:
         self.scenario = experiment.name
         self.policy = NO_POLICY if not experiment.ego else experiment.policy if name is None else name
         self._values = {"policy": policy, "drivers": drivers, "model": model, "metrics": tuple(metrics)}
-        self._policy = policy_of(experiment) if policy is None else policy
+        self._policy = policy_of(experiment) if policy is None else with_view(experiment, policy)
         self.town = map_of(experiment, town)
         self._egos = egos_of(experiment, self.town, self._policy.free)
         self._measure = self._measures(tuple(metrics))

@@ -21,6 +21,7 @@ from pydantic import (
     model_validator,
 )
 
+from limsim_jax.policies.view import view_of
 from limsim_jax.traffic.collision import AfterCollision
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -29,6 +30,8 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=60)]
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
+
+_OF_POLICY = "policy", "options", "view", "privileged"
 
 NO_POLICY = "traffic"
 """Name of the policy in results without an ego."""
@@ -103,6 +106,10 @@ class EgoTable(_Table):
     """One of `limsim_jax.policies`, or "package.module:factory" of your own."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Arguments of the policy."""
+    view: dict[str, bool | int | float] = Field(default_factory=dict)
+    """What the policy sees: fields of `policies.view.View`."""
+    privileged: bool | None = None
+    """Whether the policy gets the true state instead of a view; absent: as the policy says."""
     vehicle: str = "car"
     driver: dict[str, float] = Field(default_factory=dict)
     """Fields of `types.Driver` that differ from those of a typical driver."""
@@ -116,6 +123,12 @@ class EgoTable(_Table):
                 else "an ego with a random start has no goal of its own"
             )
         return self
+
+    @field_validator("view")
+    @classmethod
+    def _can_be_seen(cls, found: dict[str, Any]) -> dict[str, Any]:
+        view_of(found)
+        return found
 
 
 class Bounds(_Table):
@@ -158,7 +171,7 @@ class ExperimentFile(_Table):
     @classmethod
     def _one_policy(cls, egos: tuple[EgoTable, ...]) -> tuple[EgoTable, ...]:
         for ego in egos[1:]:
-            if (ego.policy, ego.options) != (egos[0].policy, egos[0].options):
+            if any(getattr(ego, name) != getattr(egos[0], name) for name in _OF_POLICY):
                 raise ValueError(f"one policy drives all egos; here are {egos[0].policy} and {ego.policy}")
         return egos
 

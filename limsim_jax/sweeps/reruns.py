@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.network import Network
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import Rss
-from limsim_jax.policies.base import PolicyLike, variants
+from limsim_jax.policies.base import Wrapper, sighted, variants
 from limsim_jax.policies.predict import Replayed, constant_velocity
 from limsim_jax.simulation.rollout import Result, Rollout, Started
 from limsim_jax.simulation.trace import Trace
@@ -190,29 +190,19 @@ class Told(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CanBrake:
+class CanBrake(Wrapper):
     """A policy beside which one vehicle brakes as hard as it can. Its memory says which."""
 
-    policy: PolicyLike
-
-    @property
-    def free(self) -> bool:
-        """That of the policy."""
-        return self.policy.free
-
-    @property
-    def others(self) -> int:
-        """Those of the policy."""
-        return getattr(self.policy, "others", 0)
+    privileged: bool = field(default=True, kw_only=True)
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         """No vehicle brakes."""
-        return Told(jnp.int32(-1), jnp.float32(jnp.inf), self.policy.init(config, lane_map, state))
+        return Told(jnp.int32(-1), jnp.float32(jnp.inf), sighted(self.policy).init(config, lane_map, state))
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Any, key: jax.Array
     ) -> tuple[Command, Any]:
         """The command of the policy, and the braking."""
-        command, inner = self.policy(config, lane_map, state, memory.policy, key)
+        command, inner = sighted(self.policy)(config, lane_map, state, memory.policy, key)
         brakes = (jnp.arange(state.lane.shape[0]) == memory.slot) & (config.time(state.step) >= memory.at)
         return replace(command, brake=brakes), memory._replace(policy=inner)

@@ -1,8 +1,8 @@
-"""PDM-Closed as a policy: the best proposal, or emergency braking."""
+"""PDM-Closed as a policy: the best proposal, or emergency braking; on request with the rules of the road."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -12,15 +12,17 @@ from jaxtyping import Array, Bool, Int
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.numerics import safe_norm
 from limsim_jax.policies.base import Policy, PolicyLike
+from limsim_jax.policies.pdm.give_way import along_with, way
 from limsim_jax.policies.pdm.proposals import FRACTIONS, idm, leaders, poses
 from limsim_jax.policies.pdm.road import DT, STEPS, Body, bodies, others_around, road_ahead
 from limsim_jax.policies.pdm.score import TTC, Scores, score
 from limsim_jax.policies.pdm.tracker import STOPPING_SPEED, drive_along, fitted
-from limsim_jax.policies.predict import Predictor, constant_velocity
+from limsim_jax.policies.predict import Predictor, along_route, constant_velocity
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.standards import COMFORT
 from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Trajectory
+from limsim_jax.traffic.engine import Traffic
 from limsim_jax.types import Config, State
 from limsim_jax.xla import computed_once
 
@@ -48,16 +50,31 @@ class PDMClosed(Policy):
     Attributes:
       seen: number of nearest other vehicles that it considers.
       strict_tuplan: conventions of the public implementation, see `limsim_jax.policies.pdm`.
-      predict: predictor of the others.
+      rules: whether it gives way as the map demands, and expects the others to follow the road and to give
+        way, too. The published planner does not; this one is named `pdm_closed_rules`.
+      predict: predictor of the others; None: constant velocity, with `rules` along their routes.
+      traffic: right of way.
+
+    Raises:
+      ValueError: no other vehicle is seen, or rules in the public implementation, which has none.
     """
 
     seen: int = 32
     strict_tuplan: bool = False
-    predict: Predictor = constant_velocity
+    rules: bool = False
+    predict: Predictor | None = None
+    traffic: Traffic = field(default_factory=Traffic)
 
     def __post_init__(self) -> None:
         if self.seen < 1:
             raise ValueError(f"seen: {self.seen} others; expected at least 1")
+        if self.rules and self.strict_tuplan:
+            raise ValueError("rules: the public implementation has none; expected rules or strict_tuplan")
+
+    @property
+    def default_name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Another one with rules."""
+        return "pdm_closed_rules" if self.rules else "pdm_closed"
 
     def variants(self, seen: Predictor) -> dict[str, PolicyLike]:
         """The policy with a reference in the place of one module.
@@ -81,9 +98,17 @@ class PDMClosed(Policy):
         body = computed_once(bodies(state, slot))
         road = computed_once(road_ahead(lane_map, state, slot, body, strict))
         moments = max(steps, STEPS + round(TTC[-1] / DT)) + 1
-        others = others_around(lane_map, state, slot, self.predict, self.seen, moments)
+        predict, first = self.predict or constant_velocity, None
+        if self.rules:
+            first = way(config, self.traffic, lane_map, state, slot)
+            road = first.stopping(road, body)
+            predict = self.predict or along_route
+        others = others_around(
+            lane_map, state, slot, predict, self.seen, moments, None if first is None else first.stop
+        )
         others = computed_once(others)
-        along = computed_once(leaders(road, body, others, steps))
+        along = leaders(road, body, others, steps)
+        along = computed_once(along if first is None else along_with(along, first, road, body))
         proposals = computed_once(idm(road, body, along, strict))
         lead = computed_once(poses(road, body, proposals, strict))
         motion = computed_once(drive_along(fitted(lead) if strict else lead, body, STEPS, strict))

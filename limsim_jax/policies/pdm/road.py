@@ -234,10 +234,14 @@ def others_around(
     predict: Predictor,
     count: int,
     moments: int,
+    stop: Float[Array, " N"] | None = None,
 ) -> Others:
-    """The `count` others that come nearest within the horizon, every `DT` s."""
+    """The `count` others that come nearest within the horizon, every `DT` s.
+
+    `stop`: m to where each vehicle will stop, as for a `Predictor`.
+    """
     times = jnp.arange(moments, dtype=state.v.dtype) * DT
-    found = predict(lane_map, state, times)
+    found = predict(lane_map, state, times, stop=stop)
     which = nearest(lane_map, state, _thinned(found), slot, count)
     heading = found.heading[which]
     pick = lambda values: jnp.moveaxis(values, -1, 0)  # noqa: E731
