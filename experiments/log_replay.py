@@ -97,10 +97,10 @@ def measure(recorded: Tracks) -> list[dict[str, Any]]:
                 "as_logged": {"takeovers": int(counts.takeovers.sum()), "bit_for_bit": same},
                 "logged_overlaps": int(scene.touched.sum()) // 2,
                 "way": name, "egos": len(contacts), "takeovers": takeovers,
-                "because_the_log_ends": int(found.ended.sum()), "handed_back": back, "in_time": in_time,
+                "carried_on": int(found.ended.sum()), "handed_back": back, "in_time": in_time,
                 "late": late, "left_or_cut_off": takeovers - in_time - late,
                 "share_in_time": in_time / (in_time + late) if seen_through else None,
-                "controlled_s": float(found.controlled.sum()) / max(takeovers, 1),
+                "controlled_s": float(found.controlled.sum()) / max(takeovers + int(found.ended.sum()), 1),
                 "largest_displacement_m": float(found.displacement.max()),
                 "longest_chain": int((found.takeovers > 0).sum(1).max()),
                 "egos_with_contact": int((contacts > 0).sum()), "contacts": int(contacts.sum()),
@@ -187,7 +187,7 @@ def table(rows: list[dict[str, Any]], policies: list[dict[str, Any]], bench: dic
     """Markdown."""
     columns = {
         "scene": "scene", "vehicles": "vehicles", "s": "seconds", "ego": "way", "egos": "egos",
-        "takeovers": "takeovers", "as the log ends": "because_the_log_ends",
+        "takeovers": "takeovers", "logs carried on": "carried_on",
         "longest chain": "longest_chain", "handed back within 20 s": "in_time",
         "later or never": "late", "left or cut off before": "left_or_cut_off",
         "share within 20 s": "share_in_time", "largest displacement, m": "largest_displacement_m",

@@ -2,11 +2,12 @@
 
     python experiments/policies.py [--seeds 1000] [--policies limsim_tm pdm_closed ...] [--scenarios ramp ...]
 
-Worlds go to results/policies. An interrupted run continues there, and `limsim-jax report results/policies`
-shows the worst worlds. Writes experiments/results/policies.json and .md; policies and scenarios that are not
-named keep their rows. `--paper 10` adds the results of the first ten seeds alone, as many as in the paper.
-Decisions are timed by `limsim-jax bench policy`; `--skip decisions` leaves that for a quiet machine. Those of
-`own_policies.py`, one in JAX and one on the host, are timed as well (`--policies own`).
+Without --seeds the long route has 300 seeds and every other scenario 1,000. Worlds go to results/policies. An
+interrupted run continues there, and `limsim-jax report results/policies` shows the worst worlds. Writes
+experiments/results/policies.json and .md; policies and scenarios that are not named keep their rows.
+`--paper 10` adds the results of the first ten seeds alone, as many as in the paper. Decisions are timed by
+`limsim-jax bench policy`; `--skip decisions` leaves that for a quiet machine. Those of `own_policies.py`, one
+in JAX and one on the host, are timed as well (`--policies own`).
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from readme_tables import PAPER, policies
 
 from limsim_jax.bench import bench_policy
 from limsim_jax.files import write_whole
+from limsim_jax.policies import POLICIES as KNOWN
+from limsim_jax.policies.base import build_policy, knows
 from limsim_jax.statistics import bootstrap, wilson
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import read_experiments
@@ -32,7 +35,11 @@ from limsim_jax.xla import enable_compilation_cache, use_all_cores
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
-POLICIES = ("like_traffic", "pdm_closed", "pdm_hybrid", "limsim_tm", "area_of_interest")
+POLICIES = (
+    "like_traffic", "pdm_closed", "pdm_closed_rules", "pdm_hybrid", "limsim_tm", "limsim_tm_privileged",
+    "area_of_interest",
+)  # fmt: skip
+SEEDS = dict.fromkeys(PAPER, 1000) | {"long_route": 300}
 OWN = ("own_policies:Cautious", "own_policies:follower")
 EVENTS = ("success", "at_fault_contacts", "contacts")
 MEANS = {"completion": "completion", "score": "limsim_faithful_drive", "nuplan": "nuplan_score"}
@@ -55,6 +62,7 @@ def worlds(policy: str, scenario: str, seeds: int, few: int, out: Path) -> dict[
         if name in {*EVENTS, *MEANS.values(), "traffic_collided", "traffic_gridlock"}
     }
     row: dict[str, Any] = {"policy": policy, "scenario": scenario, "seeds": seeds}
+    row["knows"] = knows(build_policy(KNOWN[policy], {}))
     row |= summary(found)
     if few:
         row["few"] = {"seeds": few} | summary({name: values[:few] for name, values in found.items()})
@@ -98,7 +106,7 @@ def summary(found: dict[str, np.ndarray]) -> dict[str, Any]:
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=1000)
+    parser.add_argument("--seeds", type=int)
     parser.add_argument("--paper", type=int, default=10)
     named = (*POLICIES, "own")
     parser.add_argument("--policies", nargs="+", default=list(named), choices=named)
@@ -106,7 +114,7 @@ def main() -> None:
     parser.add_argument("--skip", choices=("worlds", "decisions"))
     parser.add_argument("--out", type=Path, default=Path("results/policies"))
     options = parser.parse_args()
-    if options.seeds < 1:
+    if options.seeds is not None and options.seeds < 1:
         parser.error(f"--seeds {options.seeds}: expected at least 1")
     use_all_cores()
     enable_compilation_cache()
@@ -127,12 +135,13 @@ def main() -> None:
                 write()
             continue
         for scenario in options.scenarios:
-            few = min(options.paper, options.seeds)
+            seeds = options.seeds or SEEDS[scenario]
+            few = min(options.paper, seeds)
             if options.skip == "worlds" and (scenario, policy) not in kept:
                 parser.error(f"--skip worlds: none of {scenario} with {policy} have been run yet")
             row = kept.setdefault((scenario, policy), {})
             if options.skip != "worlds":
-                row |= worlds(policy, scenario, options.seeds, few, options.out)
+                row |= worlds(policy, scenario, seeds, few, options.out)
             if options.skip != "decisions":
                 row |= decisions(scenario, policy)
             print(json.dumps(row), flush=True)

@@ -237,17 +237,22 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
     """Scenarios and policies, with intervals; `few`: also of the first seeds, as many as the paper has."""
     titles = {"decision_ms": "decision, ms", "amortised_ms": "per vehicle in a batch, ms"}
     times = {name: title for name, title in titles.items() if any(name in r for r in result["rows"])}
-    heads = ["scenario", "policy", "seeds", "success, %", "route completion, %", "LimSim driving score",
-             "contact at fault, %", "others in contact", "gridlocks", *times.values()]  # fmt: skip
-    rows = [f"| {' | '.join(heads)} |", f"|---|---|---:|---|---:|---|---|---:|---:|{'---:|' * len(times)}"]
+    heads = ["scenario", "policy", "knows", "seeds", "success, %", "route completion, %",
+             "LimSim driving score", "contact at fault, %", "others in contact", "gridlocks",
+             *times.values()]  # fmt: skip
+    rows = [
+        f"| {' | '.join(heads)} |",
+        f"|---|---|---|---:|---|---:|---|---|---:|---:|{'---:|' * len(times)}",
+    ]
     parts = [[row, row | row["few"]] if few and "few" in row else [row] for row in result["rows"]]
     for r in itertools.chain.from_iterable(parts):
         (success, low, high), (score, least, most) = ([100 * x for x in r["success"]], r["score"])
         fault, _, bound = (100 * x for x in r["at_fault_contacts"])
-        theirs = f" ({PAPER[r['scenario']]})" if r["policy"] == "limsim_tm" else ""
+        theirs = f" ({PAPER[r['scenario']]})" if r["policy"].startswith("limsim_tm") else ""
         took = "".join(f" {r[name]:.2g} |" if name in r else " |" for name in times)
         rows.append(
-            f"| {r['scenario']} | {r['policy']} | {r['seeds']:,} | {success:.1f} [{low:.1f}, {high:.1f}] "
+            f"| {r['scenario']} | {r['policy']} | {r['knows']} | {r['seeds']:,} "
+            f"| {success:.1f} [{low:.1f}, {high:.1f}] "
             f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}]{theirs} "
             f"| {fault:.1f} (at most {bound:.1f}) "
             f"| {r['others_collided']} | {r.get('gridlocks', '')} |{took}"

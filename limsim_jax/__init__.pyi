@@ -32,6 +32,7 @@ from .policies.reference import reference_path as reference_path
 from .policies.reference import to_cartesian as to_cartesian
 from .policies.simple import ConstantSpeed as ConstantSpeed
 from .policies.simple import FollowLane as FollowLane
+from .policies.view import View as View
 from .report import plots as plots
 from .simulation.checkpoint import fork as fork
 from .simulation.rollout import Rollout as Rollout

@@ -18,6 +18,7 @@ from limsim_jax.calibration.population import estimate, few_drivers, predictive_
 from limsim_jax.calibration.result import PUBLISHED, UNITS, Calibration, common_limit
 from limsim_jax.calibration.uncertainty import uncertainty
 from limsim_jax.recordings import Recording, RecordingError, Source, as_recording, read_recordings
+from limsim_jax.recordings.checks import TOLERATED
 from limsim_jax.traffic.car_following import IDM, CarFollowing
 
 Floats = NDArray[np.float64]
@@ -29,6 +30,7 @@ def calibrate(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     length: float | None = None,
+    tolerated: float = TOLERATED,
     model: CarFollowing = IDM(),
     objective: str = "mixed",
     method: str = "lm",
@@ -61,6 +63,7 @@ def calibrate(
       units: of fields in other units, as in `{"x": "km", "v": "km/h"}`: km, cm, ft, mi; km/h, mph, ft/s; ms,
         min, h. That of `x` holds for `x_lead` and that of `v` for `v_lead` as well.
       length: m, of the leaders.
+      tolerated: share of the rows of a file that may have a leader behind or an overlap; they are left out.
       model: of car following.
       objective: what is minimised, see `fit.residuals`.
       method: "lm", "lbfgs" or "adam".
@@ -79,7 +82,7 @@ def calibrate(
     begin = time.perf_counter()
     if not 0.1 <= first <= 0.9:
         raise ValueError(f"first = {first:g}; a share from 0.1 to 0.9 is needed")
-    recordings = read_recordings(data, columns=columns, units=units, length=length)
+    recordings = read_recordings(data, columns=columns, units=units, length=length, tolerated=tolerated)
     found, quality = gather(recordings, shortest=shortest)
     early, late = split_in_time(found, first)
     both = {part.driver for part in early} & {part.driver for part in late}

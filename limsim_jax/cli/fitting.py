@@ -40,6 +40,9 @@ def calibrate(
         Literal["lm", "lbfgs", "adam"], typer.Option(help="Optimiser; lm: Levenberg-Marquardt.")
     ] = "lm",
     shortest: Annotated[float, typer.Option(help="Leave out what is shorter, s.")] = 20.0,
+    tolerated: Annotated[
+        float, typer.Option(help="Share of the rows that may have a leader behind or an overlap.")
+    ] = 0.5,
     seed: Annotated[int, typer.Option(help="Of all that is random.")] = 0,
     out: Annotated[
         Path | None, typer.Option(help="Write the population of drivers here, for [traffic] drivers = FILE.")
@@ -87,7 +90,11 @@ def calibrate(
         raise typer.BadParameter(f"{period:g} s; at least 10", param_hint="--period")
     enable_compilation_cache()
     recordings = read_recordings(
-        data, columns=_pairs(columns, "--columns"), units=_pairs(units, "--units"), length=length
+        data,
+        columns=_pairs(columns, "--columns"),
+        units=_pairs(units, "--units"),
+        length=length,
+        tolerated=tolerated,
     )
     linked = linked_recordings(recordings, period=period) if closed_loop else None
     if linked is not None:

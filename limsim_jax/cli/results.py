@@ -217,7 +217,10 @@ def compare(
     policies: Annotated[
         str | None, typer.Option(metavar="P,Q", help="Compare policy P of A with Q of B.")
     ] = None,
-    rows: Annotated[int, typer.Option(min=1, help="Print so many rows, those with most evidence.")] = 25,
+    rows: Annotated[
+        int | None,
+        typer.Option(min=1, help="Print so many rows: main metrics, then by evidence; absent: main metrics."),
+    ] = None,
     csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all rows as CSV.")] = None,
     json_file: JsonOption = None,
 ) -> None:

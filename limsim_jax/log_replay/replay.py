@@ -58,14 +58,15 @@ class Replay:
 
     @property
     def takeovers(self) -> pa.Table:
-        """One row per variant and vehicle that was taken over.
+        """One row per variant and vehicle that left its log.
 
-        Columns: variant; ego and vehicle (ids); takeovers; because_log_ends and handed_back (of these);
-        controlled (s off the log); displacement (m, largest distance from the place in the log); delayed
-        (s outside, until there was room to enter); hardest_braking (m/s^2).
+        Columns: variant; ego and vehicle (ids); takeovers; handed_back (of these); carried_on (its log ended
+        in the middle of the road near the ego, which is no takeover); controlled (s off the log);
+        displacement (m, largest distance from the place in the log); delayed (s outside, until there was
+        room to enter); hardest_braking (m/s^2).
         """
         r = self.record
-        variant, vehicle = np.nonzero(r.takeovers)
+        variant, vehicle = np.nonzero(r.takeovers + r.ended)
         ids = np.array(self.scene.vehicles)
         at = (variant, vehicle)
         return pa.table(
@@ -74,8 +75,8 @@ class Replay:
                 "ego": ids[self.ego[variant]],
                 "vehicle": ids[vehicle],
                 "takeovers": r.takeovers[at],
-                "because_log_ends": r.ended[at],
                 "handed_back": r.handed_back[at],
+                "carried_on": r.ended[at],
                 "controlled": r.controlled[at],
                 "displacement": r.displacement[at],
                 "delayed": r.delayed[at],
@@ -87,10 +88,10 @@ class Replay:
     def metrics(self) -> pa.Table:
         """One row per variant.
 
-        Columns: variant; ego (id); start (s); braking (m/s^2, if the ego brakes); vehicles (that left their
-        logs); takeovers; handed_back; contacts (pairs of bodies that overlap and do not in the log) and
-        ego_contacts (of these, with the ego); hardest_braking (m/s^2) and displacement (m) of the vehicles
-        that left their logs.
+        Columns: variant; ego (id); start (s); braking (m/s^2, if the ego brakes); vehicles (that were taken
+        over); takeovers; handed_back; carried_on (logs that ended in the middle of the road); contacts (pairs
+        of bodies that overlap and do not in the log) and ego_contacts (of these, with the ego);
+        hardest_braking (m/s^2) and displacement (m) of the vehicles that left their logs.
         """
         r = self.record
         struck = np.asarray(r.struck)
@@ -105,6 +106,7 @@ class Replay:
             "vehicles": (r.takeovers > 0).sum(-1),
             "takeovers": r.takeovers.sum(-1),
             "handed_back": r.handed_back.sum(-1),
+            "carried_on": r.ended.sum(-1),
             "contacts": struck.sum((1, 2)) // 2,
             "ego_contacts": struck[np.arange(len(self)), self.ego].sum(-1),
             "hardest_braking": r.hardest.max(-1),
@@ -247,9 +249,10 @@ class Replay:
         pairs, met = int(struck.sum()) // 2, int(struck.any((1, 2)).sum())
         lines = [
             f"{int(r.takeovers.sum())} takeovers of other vehicles, {int(r.handed_back.sum())} handed back",
+            *([f"{int(r.ended.sum())} logs that end on the road were carried on"] if r.ended.any() else []),
             f"{pairs} contacts" + (f", in {met} variants" if len(self) > 1 else ""),
         ]
-        if (r.takeovers > 0).any():
+        if (r.takeovers + r.ended > 0).any():
             lines.append(
                 f"hardest braking off the log {float(r.hardest.max()):.1f} m/s^2, largest displacement "
                 f"{float(r.displacement.max()):.1f} m"

@@ -2,11 +2,11 @@
 
 Every vehicle is on its LOG, under control (CTRL) of a car-following model, or on its RETURN to the log:
 
-- LOG to CTRL, for one of three reasons. The predicted path of a vehicle off its log (an ego, or one under
-  control) meets the logged path within `horizon`, where the log had more room. Or that vehicle is the leader,
-  and the logged motion would reach it within `ttc`, or make the IDM brake harder than `braking`. Or the log
-  ends in the middle of the road near the ego. Followers of a vehicle that is taken over are checked again in
-  the same step.
+- LOG to CTRL, a takeover, for one of two reasons. The predicted path of a vehicle off its log (an ego, or one
+  under control) meets the logged path within `horizon`, where the log had more room. Or that vehicle is the
+  leader, and the logged motion would reach it within `ttc`, or make the IDM brake harder than `braking`.
+  Followers of a vehicle that is taken over are checked again in the same step. A log that ends in the middle
+  of the road near the ego is carried on in the same way; that is no takeover.
 - CTRL: along the path of the own log, with the lane changes in it, by car following.
 - CTRL to RETURN, after `clear` s without any of these reasons: along the path at the speed of the log, faster
   or slower to catch up with its place there, but never faster than car following allows.
@@ -101,7 +101,7 @@ class Record:
     """Counts of every vehicle; the ego itself is not among the takeovers."""
 
     takeovers: Int[Array, " N"]
-    ended: Int[Array, " N"]  # of these, because the log ended
+    ended: Int[Array, " N"]  # logs that ended in the middle of the road, and are carried on
     handed_back: Int[Array, " N"]
     in_time: Int[Array, " N"]  # of these, within `patience`
     late: Int[Array, " N"]  # takeovers that have lasted longer than that
@@ -193,7 +193,7 @@ class _Events(NamedTuple):
     mine: Bool[Array, " N"]  # the ego
     gone: Bool[Array, " N"]  # has left
     taken: Bool[Array, " N"]  # has been taken over, or has entered late
-    ended: Bool[Array, " N"]  # of these, because its log ends
+    ended: Bool[Array, " N"]  # of these, because its log ends: no takeover, it is carried on
     back: Bool[Array, " N"]  # has been handed back
     behind: Float[Array, " N"]  # m along the path to the place in the log, 0 where there is none
 
@@ -562,11 +562,11 @@ def _count(
     struck = ~(apart | apart.T) & moment.active[:, None] & moment.active[None, :]
     struck &= (strays[:, None] | strays[None, :]) & ~scene.touched & ~jnp.eye(len(v), dtype=bool)
     return Record(
-        takeovers=counts.takeovers + (events.taken & others).astype(one),
+        takeovers=counts.takeovers + (events.taken & ~events.ended & others).astype(one),
         ended=counts.ended + (events.ended & others).astype(one),
         handed_back=counts.handed_back + back.astype(one),
         in_time=counts.in_time + (back & (before.off <= options.patience)).astype(one),
-        late=counts.late + overdue.astype(one),
+        late=counts.late + (overdue & (counts.ended == 0)).astype(one),
         controlled=counts.controlled + jnp.where(off_log & others, dt, 0.0),
         displacement=jnp.maximum(counts.displacement, jnp.where(off_log & others, jnp.abs(events.behind), 0)),
         delayed=counts.delayed + jnp.where(now.waiting, dt, 0.0),

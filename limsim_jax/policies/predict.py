@@ -1,9 +1,9 @@
 """Predictions: positions of all vehicles at later moments, as arrays.
 
-A `Predictor` is a function; planners take any. `along_route` keeps the speed and follows the true route,
-`constant_velocity` keeps speed and heading, as in PDM (Dauner et al., CoRL 2023). `Replayed` is the recorded
-future. All use the plans that planned vehicles share, see `shared`. `hypotheses` has several futures of a
-vehicle where lanes split. There is no gradient through the choice of the lane.
+A `Predictor` is a function; planners take any. `along_route` keeps the speed and follows the routes of the
+state, which are beliefs in a view (`view.routes`). `constant_velocity` keeps speed and heading, as in PDM
+(Dauner et al., CoRL 2023). `Replayed` is the recorded future. All use the plans that planned vehicles share,
+see `shared`. There is no gradient through the choice of the lane.
 """
 
 from __future__ import annotations
@@ -43,19 +43,6 @@ class Prediction:
     x: Float[Array, "N H"]  # m, centre of the body
     y: Float[Array, "N H"]
     heading: Float[Array, "N H"]  # rad
-    length: Float[Array, " N"]  # m
-    width: Float[Array, " N"]
-    times: Float[Array, " H"]  # s from now
-
-
-@struct.dataclass(frozen=True, kw_only=True)
-class Hypotheses:
-    """`M` predictions of each vehicle, with their probabilities."""
-
-    x: Float[Array, "N M H"]  # m, centre of the body
-    y: Float[Array, "N M H"]
-    heading: Float[Array, "N M H"]  # rad
-    weight: Float[Array, "N M"]  # sums to 1; 0 where there are fewer
     length: Float[Array, " N"]  # m
     width: Float[Array, " N"]
     times: Float[Array, " H"]  # s from now
@@ -209,74 +196,6 @@ class Replayed:
             x=x, y=y, heading=heading, length=shape.length, width=shape.width, times=times
         )
         return _with(prediction, plans)
-
-
-@jax.named_scope("hypotheses")
-def hypotheses(
-    lane_map: LaneMap,
-    state: State,
-    times: Float[Array, " H"],
-    *,
-    modes: int = 3,
-    known: float | None = None,
-    stop: Float[Array, " N"] | None = None,
-) -> Hypotheses:
-    """One prediction per successor at the next split of lanes.
-
-    Beyond the split a vehicle that leaves its route takes the first successor of each lane.
-
-    Args:
-      lane_map: the map.
-      state: the world now.
-      times: s from now.
-      modes: `M`; further successors are left out.
-      known: probability of the successor on the route, the others share the rest equally; None: the route is
-      not
-        known, and all successors are equally likely.
-      stop: as in `along_route`, for all of them.
-
-    Raises:
-      ValueError: `known` is not within 0 and 1.
-    """
-    if known is not None and not 0 <= known <= 1:
-        raise ValueError(f"known: {known}; expected a probability within 0 and 1")
-    start = _start(lane_map, state)
-    route, _ = _route(lane_map, state, start.lane)
-    count = (lane_map.successors != NO_LANE).sum(-1)
-    # the lane before the split, as a place in the route
-    splits = (count[route] > 1) & (route != NO_LANE)
-    split = jnp.where(splits.any(-1), jnp.argmax(splits, -1), route.shape[-1])
-    before = jnp.take_along_axis(route, jnp.minimum(split, route.shape[-1] - 1)[:, None], -1)[:, 0]
-    exists = [split < route.shape[-1]]
-    found, weights = [], []
-    taken = route[:, 1:]
-    for mode in range(modes):
-        branch = lane_map.successors[before, mode] if mode < lane_map.successors.shape[1] else before * 0 - 1
-        there = exists[0] & (branch != NO_LANE)
-        rows, begins = [start.lane], [-start.s]
-        on_route = jnp.ones_like(there)
-        for k in range(_LANES):
-            at_split = there & (split == k)
-            after = jnp.where(on_route, taken[:, k], lane_map.successors[rows[-1], 0])
-            after = jnp.where(at_split, branch, after)
-            on_route &= after == taken[:, k]
-            begins.append(jnp.where(after == NO_LANE, 1e9, begins[-1] + lane_map.length[rows[-1]]))
-            rows.append(after)
-        ahead = jnp.stack(rows, -1), jnp.stack(begins, -1)
-        found.append(_along(lane_map, state, start, *ahead, times, stop))
-        share = safe_divide(jnp.ones_like(state.v), jnp.minimum(count[before], modes).astype(state.v.dtype))
-        if known is not None:
-            mine = (jnp.take_along_axis(taken, jnp.minimum(split, _LANES - 1)[:, None], -1)[:, 0]) == branch
-            rest = jnp.maximum(jnp.minimum(count[before], modes) - 1, 1).astype(state.v.dtype)
-            share = jnp.where(mine, known, (1 - known) / rest)
-        weights.append(jnp.where(there, share, jnp.where(exists[0] | (mode > 0), 0.0, 1.0)))
-    weight = jnp.stack(weights, -1)
-    weight = safe_divide(weight, jnp.broadcast_to(weight.sum(-1, keepdims=True), weight.shape))
-    x, y, heading = (jnp.stack(values, 1) for values in zip(*found, strict=True))
-    shape = state.shape
-    return Hypotheses(
-        x=x, y=y, heading=heading, weight=weight, length=shape.length, width=shape.width, times=times
-    )
 
 
 def nearest(

@@ -54,6 +54,14 @@ def pdm_closed_rules(seen: int = 32) -> PDMClosed:
     return PDMClosed(seen=seen, rules=True)
 
 
+def limsim_tm_privileged(**options: Any) -> PolicyLike:
+    """`LimSimTM` that knows the routes and drivers of all vehicles.
+
+    `options` are those of `LimSimTM`.
+    """
+    return build_policy(LimSimTM, {"name": "limsim_tm_privileged", **options, "privileged": True})
+
+
 POLICIES: dict[str, Callable[..., PolicyLike]] = {
     "like_traffic": LikeTraffic,
     "constant_speed": ConstantSpeed,
@@ -62,6 +70,7 @@ POLICIES: dict[str, Callable[..., PolicyLike]] = {
     "pdm_closed_rules": pdm_closed_rules,
     "pdm_hybrid": PDMHybrid,
     "limsim_tm": LimSimTM,
+    "limsim_tm_privileged": limsim_tm_privileged,
     "area_of_interest": area_of_interest,
 }
 """Factories by name; other policies are named by module and factory, `package.module:factory`."""

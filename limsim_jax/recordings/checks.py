@@ -18,8 +18,8 @@ from limsim_jax.recordings.recording import (
     RecordingError,
 )
 
-TOLERATED = 0.05
-"""Share of the followers of a file that may have defects."""
+TOLERATED = 0.5
+"""Share of the rows of followers that may have a leader behind or an overlap: more is a fault of the file."""
 
 _HINTS = {
     3.281: "positions in feet",
@@ -31,25 +31,33 @@ _HINTS = {
 """What it means if positions advance this many times as far as the speeds say."""
 
 
-def checked(recording: Recording) -> Recording:
+def checked(recording: Recording, tolerated: float = TOLERATED) -> Recording:
     """The recording with its defects.
 
+    Args:
+      recording: as read.
+      tolerated: share of the rows of followers that may have a leader behind or an overlap.
+
     Raises:
-      RecordingError: units are wrong, no vehicle follows another, or too many followers have defects.
+      RecordingError: units are wrong, no vehicle follows another, or too many rows have defects.
     """
+    if not 0 <= tolerated <= 1:
+        raise RecordingError(f"tolerated: {tolerated:g}; a share within 0 and 1 is expected")
     _check_units(recording)
     defects = tuple(_defects(recording))
     recording = replace(recording, defects=defects)
-    followers = len(np.unique(recording.vehicle[recording.leader >= 0]))
-    if not followers:
+    rows = int((recording.leader >= 0).sum())
+    if not rows:
         raise RecordingError(
             f"{recording.source}: {recording.row} {recording.line[0]}: no vehicle follows another one"
         )
-    bad = {defect.vehicle for defect in defects if defect.kind != "spacing"}
-    if len(bad) > TOLERATED * followers:
-        more = f" (and {len(defects) - 1} more like this)" if len(defects) > 1 else ""
-        first = next(iter(defects)).message
-        raise RecordingError(f"{recording.source}: {first}{more}")
+    found = [defect for defect in defects if defect.rows and defect.kind != "spacing"]
+    bad = sum(defect.rows for defect in found)
+    if bad > tolerated * rows:
+        raise RecordingError(
+            f"{recording.source}: {found[0].message}; so are {bad:,} of {rows:,} rows, and at most "
+            f"{100 * tolerated:g} % are tolerated (tolerated, --tolerated)"
+        )
     return recording
 
 

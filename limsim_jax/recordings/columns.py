@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from limsim_jax.recordings.checks import checked
+from limsim_jax.recordings.checks import TOLERATED, checked
 from limsim_jax.recordings.recording import CAR, Floats, Ints, Recording, RecordingError, build_recording
 from limsim_jax.recordings.table import Table, header_of, numbered, read_bytes
 
@@ -47,6 +47,7 @@ def read_columns(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     length: float | None = None,
+    tolerated: float = TOLERATED,
 ) -> Recording:
     """A recording from a table of one's own.
 
@@ -56,6 +57,7 @@ def read_columns(
       units: of fields whose unit is not that of the module: km, cm, ft, mi; km/h, mph, ft/s; ms, min, h.
         That of `x` holds for `x_lead` and that of `v` for `v_lead` if these have none of their own.
       length: m, of the leaders, if no column tells it.
+      tolerated: share of the rows that may have a leader behind or an overlap; they are left out.
 
     Raises:
       RecordingError: one line with the row and column: a column is missing, a value is no finite number, or
@@ -105,7 +107,7 @@ def read_columns(
             "vehicle_class": np.full(len(table), CAR),
         },
     )  # fmt: skip
-    return checked(recording)
+    return checked(recording, tolerated)
 
 
 def has_fields(columns: list[str]) -> bool:

@@ -3,7 +3,8 @@
 The kind of a file is told by its columns. Whatever makes a number mean something else (columns or values
 missing, wrong units, a time twice) refuses the file with a `RecordingError`. Defects that real recordings
 have here and there (time missing, bodies that overlap, a leader behind its follower) are listed in
-`Recording.defects`, unless more than `checks.TOLERATED` of the followers have some: then they too refuse it.
+`Recording.defects`, and calibration leaves these stretches out. A file is refused if more than
+`checks.TOLERATED` of its rows have some.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from limsim_jax.maps.network import MapError
-from limsim_jax.recordings.checks import checked
+from limsim_jax.recordings.checks import TOLERATED, checked
 from limsim_jax.recordings.columns import example, has_fields, read_columns
 from limsim_jax.recordings.commonroad import read_commonroad, read_commonroad_tracks
 from limsim_jax.recordings.highd import read_highd
@@ -40,12 +41,13 @@ _READERS = (
 KINDS = "NGSIM, TGSIM pairs, OpenACC, highD, inD, CommonRoad"
 
 
-def read_recording(path: str | Path) -> Recording:
+def read_recording(path: str | Path, *, tolerated: float = TOLERATED) -> Recording:
     """Read followers and leaders; of highD and inD the `..._tracks.csv`, with its meta files beside it.
 
     Args:
       path: of a file of NGSIM (feet, or the metric table of pairs), TGSIM pairs, OpenACC, highD, inD and
         its relatives (rounD, exiD, uniD), or CommonRoad; also gzipped.
+      tolerated: share of the rows of followers that may have a leader behind or an overlap.
 
     Raises:
       RecordingError: what is wrong and where, in one line.
@@ -54,22 +56,22 @@ def read_recording(path: str | Path) -> Recording:
     data = read_bytes(path)
     if _is_xml(data):
         try:
-            return checked(read_commonroad(path, data))
+            return checked(read_commonroad(path, data), tolerated)
         except MapError as error:
             raise RecordingError(str(error)) from None
     columns = header_of(data)
     if columns[0] in ("Date", "Vehicle_order"):
-        return checked(read_openacc(path, data))
+        return checked(read_openacc(path, data), tolerated)
     known = {name.lower() for name in columns}
     for signs, reader in _READERS:
         if signs <= known:
-            return checked(reader(Table.read(path, data)))
+            return checked(reader(Table.read(path, data)), tolerated)
     near = max(_READERS, key=lambda reader: len(reader[0] & known))[0]
     if near & known:
         missing = ", ".join(sorted(near - known))
         raise RecordingError(f"{path}: line 1: column {missing} is missing; found are {', '.join(columns)}")
     if has_fields(columns):
-        return read_columns(path)
+        return read_columns(path, tolerated=tolerated)
     raise RecordingError(
         f"{path}: line 1: no recording of a known kind ({KINDS}); found are {', '.join(columns)[:200]}; "
         f"{example(columns)}"
@@ -82,6 +84,7 @@ def read_recordings(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     length: float | None = None,
+    tolerated: float = TOLERATED,
 ) -> list[Recording]:
     """Recordings of anything that holds followers and leaders.
 
@@ -90,6 +93,7 @@ def read_recordings(
       columns: of a table of one's own, see `read_columns`.
       units: likewise.
       length: likewise, m.
+      tolerated: share of the rows of followers that may have a leader behind or an overlap.
 
     Raises:
       RecordingError: what is wrong and where, in one line.
@@ -101,8 +105,8 @@ def read_recordings(
         if isinstance(one, Recording):
             return one
         if own or not isinstance(one, (str, Path)) or Path(one).suffix.lower() in (".parquet", ".pq"):
-            return read_columns(one, columns=columns, units=units, length=length)
-        return read_recording(one)
+            return read_columns(one, columns=columns, units=units, length=length, tolerated=tolerated)
+        return read_recording(one, tolerated=tolerated)
 
     found = [read(one) for one in (data if several else [data])]
     if several:  # tables have no names that tell their drivers apart

@@ -74,8 +74,8 @@ class Comparison(NamedTuple):
     table: pa.Table
     notes: list[str]
 
-    def text(self, k: int = 25) -> TextTable:
-        """Its first `k` rows as a table to print."""
+    def text(self, k: int | None = None) -> TextTable:
+        """Its main metrics to print, or its first `k` rows."""
         return comparison_text(self, k)
 
     def __str__(self) -> str:
@@ -130,9 +130,12 @@ def compare(
     return Comparison(pa.Table.from_pylist(clean, _SCHEMA), list(dict.fromkeys(notes)))
 
 
-def comparison_text(comparison: Comparison, k: int = 25) -> TextTable:
-    """The main metrics, then the strongest evidence, as text; k rows at most."""
-    rows = comparison.table.slice(0, k).to_pylist()
+def comparison_text(comparison: Comparison, k: int | None = None) -> TextTable:
+    """The main metrics as text; with `k` so many rows: these, then the strongest evidence."""
+    rows = comparison.table.to_pylist()
+    if k is None:
+        k = sum(row["metric"] in COMPARED for row in rows) or len(rows)
+    rows = rows[:k]
     scenarios = {row["scenario"] for row in comparison.table.select(["scenario"]).to_pylist()}
     several = len(scenarios) > 1
     header = ["scenario"] * several + ["metric", "A", "B", "B - A", "seeds", "p", "p adjusted", "better"]
@@ -149,10 +152,9 @@ def comparison_text(comparison: Comparison, k: int = 25) -> TextTable:
     rest = comparison.table.num_rows - len(rows)
     notes = [
         *comparison.notes,
-        "The main metrics first, then the strongest evidence. better: only where p, adjusted for the number "
-        "of rows (Holm), is small.",
+        "better: only where p, adjusted for the number of all rows (Holm), is small.",
     ]
-    notes += [f"{rest:,} rows with less evidence are not shown"] if rest else []
+    notes += [f"{rest:,} more rows, by evidence: --rows {len(rows) + rest}"] if rest else []
     return TextTable(header, lines, notes)
 
 

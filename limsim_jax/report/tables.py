@@ -275,6 +275,9 @@ def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = 
     several = len({policy for _, policy in order}) > 1
     header = ["", *(f"{scenario} / {policy}" if several else scenario for scenario, policy in order)]
     rows = [["seeds", *(f"{max(r['seeds'] for g, r in found.items() if g[:2] == o):,}" for o in order)]]
+    told = [knows(results, group) for group in order]
+    if any(told):
+        rows.append([KNOWS, *told])
     for main in short_list(found):
         cells = [cell(main, found.get((*group, main.metric))) for group in order]
         if any(cells):
@@ -293,6 +296,18 @@ def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = 
             f"At least, at most: one-sided {100 * level:g} % bounds for what happened in all or none."
         )
     return TextTable(header, rows, notes)
+
+
+KNOWS = "knows of other vehicles"
+
+
+def knows(results: Results, group: Group) -> str:
+    """What the policy of a group knows: all (the state) or what it sees (a view).
+
+    Empty without an ego, and in results that do not say it.
+    """
+    words = {"state": "all", "view": "what it sees"}
+    return words.get(results.provenance.get(group, {}).get("knows", ""), "")
 
 
 def _causes_note(group: Group, part: pa.Table, several: bool) -> str:

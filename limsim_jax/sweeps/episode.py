@@ -29,7 +29,7 @@ from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos, EvaluateTraffic
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.policies.area import PARTS
-from limsim_jax.policies.base import PolicyLike, check_policy, policy_name
+from limsim_jax.policies.base import PolicyLike, check_policy, knows, policy_name
 from limsim_jax.policies.host import failure_reasons
 from limsim_jax.simulation.ending import Watch
 from limsim_jax.simulation.rollout import Rollout, decision_key
@@ -248,6 +248,7 @@ class Episodes:
             **{name: describe(value) for name, value in self._values.items() if value and name != "policy"},
             **({"policy": without_sources(describe(policy))} if policy is not None else {}),
             **({"policy_code": self._code} if self._code else {}),
+            **({"knows": knows(self._policy)} if self.egos else {}),
             "experiment": self.experiment.model_dump(mode="json", exclude={"map"}),
             "map": {"file": os.path.basename(self.network.source), "hash": self.network.file_hash},
             "map_file": self._map_file(),

@@ -183,7 +183,8 @@ def test_a_vehicle_waits_outside_where_another_one_stands():
 def test_a_log_that_ends_beside_a_strayed_ego_is_carried_on():
     counts, moments = one(variants(), 2)
     end = round(OUT / DT)
-    assert moments.active[end + 50, ENDING] and counts.ended[ENDING] == 1
+    assert moments.active[end + 50, ENDING]
+    assert counts.ended[ENDING] == 1 and counts.takeovers[ENDING] == counts.late[ENDING] == 0
     assert moments.y[end + 50, ENDING] == pytest.approx(moments.y[end, ENDING], abs=0.01)
     assert moments.x[end + 50, ENDING] > moments.x[end, ENDING] + 50
     assert not one(variants(), 0)[1].active[end + 1, ENDING]

@@ -15,11 +15,13 @@ from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import lane_states
 from limsim_jax.metrics.motion import motion_init, motion_result, motion_update
+from limsim_jax.policies.base import policy_name
 from limsim_jax.policies.pdm import PDMClosed
 from limsim_jax.policies.pdm import proposals as pdm_proposals
 from limsim_jax.policies.pdm import road as pdm_road
 from limsim_jax.policies.pdm import score as pdm_score
 from limsim_jax.policies.pdm import tracker as pdm_tracker
+from limsim_jax.policies.pdm.give_way import Way, along_with
 from limsim_jax.policies.reference import ReferencePath
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.trace import trace
@@ -616,3 +618,74 @@ def test_it_follows_a_leader_to_a_red_light_and_waits():
     gap = np.hypot(*(seen.box[:, 0, :2] - seen.box[:, 1, :2]).T) - 5.0
     assert gap.min() > 0.3 and seen.v[-1].max() < 3.0 and seen.active[-1, :2].all()
     assert np.abs(seen.a[:, 0]).max() < 4.5 and np.abs(seen.d[:, 0]).max() < 1.5
+
+
+# --- with the rules of the road ----------------------------------------------------------------------
+
+
+def test_the_vehicle_that_goes_first_is_one_more_leader():
+    road, planned = straight_road(), body((10.0, 8.0))
+    moments = 5
+    along = pdm_proposals.Leaders(
+        rear=jnp.full((moments, 2, 3, 4), 50.0), centre=jnp.full((moments, 2, 4), 52.0),
+        v=jnp.full((moments, 2, 4), 3.0),
+    )  # fmt: skip
+    first = Way(
+        wall=jnp.array([30.0, 1e6]), gap=jnp.array([20.0, pdm_road.FAR]), v=jnp.array([4.0, 9.0]),
+        stop=jnp.zeros(2),
+    )  # fmt: skip
+    found = along_with(along, first, road, planned)
+    front = float(road.s[0] + planned.wheelbase[0] / 2 + planned.length[0] / 2)
+    for moment in range(moments):
+        t = moment * pdm_road.LOOK_EVERY * pdm_road.DT
+        np.testing.assert_allclose(found.rear[moment, 0, :, -1], front + 20.0 + 4.0 * t, rtol=1e-6)
+        np.testing.assert_allclose(found.v[moment, :, -1], [4.0, 9.0])
+        assert (np.asarray(found.rear[moment, 1, :, -1]) >= pdm_road.FAR).all()
+        np.testing.assert_array_equal(found.rear[moment, ..., :-1], along.rear[moment])
+    walls = np.asarray(first.stopping(road, planned).wall)
+    np.testing.assert_allclose(walls[0], front + 30.0)
+    np.testing.assert_array_equal(walls[1], road.wall[1])
+    # towards another lane the road has walls of its own
+    other = road._replace(worth=jnp.asarray([[0.0, 0.0, 15.0], [0.0, 0.0, 0.0]]))
+    np.testing.assert_array_equal(first.stopping(other, planned).wall, road.wall)
+
+
+def test_rules_wait_where_the_map_demands():
+    """Before a vehicle that comes round a roundabout PDM-Closed goes, and with rules it waits."""
+    lane_map = bundled("roundabout")[1]
+    m = jax.tree.map(np.asarray, lane_map)
+    entries = [i for i in range(len(m.length)) if m.length[i] > 100 and (m.successors[i] >= 0).sum() == 1]
+    ring = [i for i in range(len(m.length)) if 5 < m.length[i] < 60 and (m.successors[i] >= 0).any()]
+    worlds = []
+    for entry in entries:
+        for place in ring:
+            goal = [int(np.argmax(m.routes.next_lane[x] >= 0)) for x in (entry, place)]
+            seats = [m.length[entry] - 20.0, m.length[place] - 1.0]
+            state = state_of("roundabout", [entry, place], seats, [7.0, 11.0], goal)
+            egos = from_lane(lane_map, state, boxes(lane_map, state), [0], True)
+            worlds.append(dataclasses.replace(state, egos=egos))
+    worlds = jax.tree.map(lambda *x: jnp.stack(x), *worlds)
+    alone = dataclasses.replace(worlds, active=worlds.active.at[:, 1].set(False))
+
+    def crosses(policy, states):
+        """Whether the front passes the end of the lane within the plan."""
+
+        def one(state):
+            path = policy.plan(CONFIG, lane_map, state).trajectory
+            steps = jnp.hypot(jnp.diff(path.x[0]), jnp.diff(path.y[0])).sum()
+            return steps > 20.0
+
+        return np.asarray(jax.jit(jax.vmap(one))(states))
+
+    rules = PDMClosed(rules=True)
+    waits = crosses(rules, alone) & ~crosses(rules, worlds)
+    goes = crosses(PDMClosed(), worlds)
+    assert waits.sum() >= 10
+    assert (waits & goes).sum() >= 10
+
+
+def test_the_public_implementation_has_no_rules():
+    with pytest.raises(ValueError, match="expected rules or strict_tuplan"):
+        PDMClosed(rules=True, strict_tuplan=True)
+    assert policy_name(PDMClosed(rules=True)) == "pdm_closed_rules"
+    assert policy_name(PDMClosed()) == "pdm_closed"

@@ -14,7 +14,6 @@ from limsim_jax.policies.predict import (
     Replayed,
     along_route,
     constant_velocity,
-    hypotheses,
     nearest,
     shared,
 )
@@ -162,29 +161,6 @@ def test_constant_velocity_keeps_the_heading():
     t, v = np.asarray(TIMES)[None], np.asarray(state.v)[:, None]
     np.testing.assert_allclose(found.x, box[:, :1] + v * t * np.cos(box[:, 2:3]), atol=1e-3)
     np.testing.assert_allclose(found.y, box[:, 1:2] + v * t * np.sin(box[:, 2:3]), atol=1e-3)
-
-
-def test_hypotheses_take_every_branch():
-    state, lane_map = scattered("roundabout", N, 2), bundled("roundabout")[1]
-    times = jnp.arange(13.0)
-    found = jax.jit(lambda state: hypotheses(lane_map, state, times))(state)
-    weight = np.asarray(found.weight)
-    np.testing.assert_allclose(weight.sum(1), 1, atol=1e-6)
-    several = (weight > 0).sum(1)
-    assert (several > 1).sum() >= 4 and (several == 1).any()
-    own = predict(lane_map, state, times)
-    for i in range(N):
-        modes = [m for m in range(3) if weight[i, m] > 0]
-        ends = [(float(found.x[i, m, -1]), float(found.y[i, m, -1])) for m in modes]
-        apart = [np.hypot(a[0] - b[0], a[1] - b[1]) for k, a in enumerate(ends) for b in ends[:k]]
-        assert min(apart, default=9.0) > 3.0, "branches end in different places"
-        gaps = np.abs(np.asarray(found.x)[i, modes] - np.asarray(own.x)[i]).max(-1)
-        assert gaps.min() < 1.0, "one of them is the route"
-    sure = hypotheses(lane_map, state, times, known=0.8)
-    with_split = several > 1
-    assert np.allclose(np.asarray(sure.weight)[with_split].max(-1), 0.8)
-    with pytest.raises(ValueError, match=r"known: 1\.5; expected a probability"):
-        hypotheses(lane_map, state, times, known=1.5)
 
 
 def test_nearest_is_a_sort_of_distances():

@@ -106,7 +106,7 @@ def at(values, row, value):
     [
         (pair(leader=at(X_LEAD, 17, np.nan)), {}, "data: row 17, column leader: 'nan'; a finite number"),
         (pair(t=at(T, 20, T[19])), {}, "row 20, column t: this vehicle is at t = 1.90 s already"),
-        (pair(leader=at(X_LEAD, 40, 0.0)), {}, "row 40, column leader: leader leader is"),
+        (pair(leader=at(X_LEAD, 40, 0.0)), {"tolerated": 0.0}, "row 40, column leader: leader leader is"),
         (pair(leader=X, follower=X_LEAD), {}, "column leader: leader leader is"),
         (pair(leader=-X_LEAD, follower=-X), {}, "positions fall; positions that grow along the road"),
         (pair(t=T * 1000), {}, "column t: steps of 100 s; 0.01 to 0.5 s are expected"),

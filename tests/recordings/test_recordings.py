@@ -322,6 +322,9 @@ BAD = {
         edited(lambda lines: [*lines[:50], lines[49], *lines[50:]]),
         "line 51, column frame_id",
     ),
+}
+
+DEFECTS = {
     "gap in time": (
         edited(lambda lines: lines[:40] + lines[80:]),
         "line 41, column frame_id: 4.1 s are missing",
@@ -340,6 +343,38 @@ def test_bad_input_is_named_by_line_and_column(name, tmp_path):
     assert str(caught.value).startswith(f"{path}: ")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_defect_costs_its_stretch_and_not_the_file(name, tmp_path):
+    text, message = DEFECTS[name]
+    path = pairs_file(tmp_path, text)
+    found, quality = segments(read_recording(path), shortest=3.0)
+    assert any(message in finding for finding in quality.findings)
+    # of two followers of 30 s: what is missing or overlaps, and 1 s on either side of an overlap
+    assert sum(part.duration for part in found) == pytest.approx(
+        56.0 if name == "gap in time" else 58.0, abs=0.6
+    )
+    assert min(part.gap.min() for part in found) > 1
+    if name != "gap in time":
+        with pytest.raises(RecordingError, match=r"so are 1 of 602 rows, and at most 0 % are tolerated"):
+            read_recording(path, tolerated=0.0)
+
+
+def test_a_file_that_is_wrong_as_a_whole_is_refused(tmp_path):
+    def swap(lines):
+        at = [PAIR_COLUMNS.index(name) for name in ("local_y", "preceding_local_y")]
+        for k, line in enumerate(lines[1:], 1):
+            values = line.split(",")
+            values[at[0]], values[at[1]] = values[at[1]], values[at[0]]
+            lines[k] = ",".join(values)
+        return lines
+
+    path = pairs_file(tmp_path, edited(swap))
+    with pytest.raises(RecordingError, match=r"line 2, column preceding_local_y: leader 1 is .* behind"):
+        read_recording(path)
+    with pytest.raises(RecordingError, match=r"tolerated: 1\.5; a share within 0 and 1 is expected"):
+        read_recording(path, tolerated=1.5)
 
 
 def scaled(columns, factor):

@@ -85,7 +85,9 @@ def test_the_main_metrics_come_first_then_strong_evidence():
     assert (rows["min_ttc"]["p"], rows["min_ttc"]["lower"], rows["min_ttc"]["upper"]) == (1.0, 0.0, 0.0)
     text = comparison_text(found, k=1)
     assert text.rows[0][0] == "min_ttc" and text.rows[0][-1] == ""
-    assert text.notes[-1] == "2 rows with less evidence are not shown"
+    assert text.notes[-1] == "2 more rows, by evidence: --rows 3"
+    assert [row[0] for row in comparison_text(found).rows] == ["min_ttc"]  # of these the one main metric
+    assert len(comparison_text(found, k=3).rows) == 3
 
 
 def test_crashes_per_distance_are_compared_over_all_seeds():

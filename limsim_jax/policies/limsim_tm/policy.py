@@ -44,9 +44,8 @@ class Memory(NamedTuple):
 class LimSimTM(Policy):
     """Chooses a maneuver by search, then plans a trajectory.
 
-    Right of way is that of the traffic model. By default it knows the routes of all vehicles (`along_route`),
-    the driver parameters of the vehicles that it searches for, and the right of way that the traffic will
-    follow.
+    Right of way is that of the map, as the traffic model reads it. Routes and drivers of other vehicles are
+    those of its view: beliefs, unless it is `privileged`.
 
     Attributes:
       others: vehicles of the traffic that it drives beside the egos, see `AreaOfInterest`.

@@ -8,7 +8,7 @@ direction, progress, time to collision and comfort, against a forecast of all ot
 velocity. If the best proposal still leads to a contact soon, the vehicle brakes.
 
 It sees positions, headings and speeds of the others, and lights. It knows no routes, driver parameters, turn
-signals or right of way.
+signals or right of way. `PDMClosed(rules=True)` gives way as the map demands, see `pdm.give_way`.
 
 By default a few things differ from the public implementation. `strict_tuplan` restores its conventions:
 

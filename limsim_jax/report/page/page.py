@@ -46,7 +46,18 @@ from limsim_jax.report.page.content import (
     worst_crash,
     worst_row,
 )
-from limsim_jax.report.tables import Group, better, columns, groups, lookup, short_list, summary, worst
+from limsim_jax.report.tables import (
+    KNOWS,
+    Group,
+    better,
+    columns,
+    groups,
+    knows,
+    lookup,
+    short_list,
+    summary,
+    worst,
+)
 from limsim_jax.report.templates import read, render
 
 if TYPE_CHECKING:
@@ -113,7 +124,7 @@ def write_report(
         heads=[names.head(group) for group in parts],
         verdict=verdict(results, parts, {key_of(row) for row in shown}, names, level),
         episodes=[part.num_rows for part in parts.values()],
-        main=_main(parts, found),
+        main=_main(results, parts, found),
         cards=cards,
         listed=[worst_row(row, replays.get(key_of(row)), names) for row in listed],
         failures=failures(parts, replays),
@@ -208,8 +219,12 @@ def _shown(
 # --- metrics
 
 
-def _main(parts: Mapping[Group, pa.Table], found: Found) -> list[dict[str, Any]]:
+def _main(results: Results, parts: Mapping[Group, pa.Table], found: Found) -> list[dict[str, Any]]:
     rows = []
+    told = [knows(results, group) for group in parts]
+    if any(told):
+        cells = [{"value": words, "interval": "", "measured": None} if words else None for words in told]
+        rows.append({"label": KNOWS, "unit": "", "cells": cells})
     for main in short_list(found):
         cells = []
         for group in parts:
