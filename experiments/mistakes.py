@@ -88,7 +88,7 @@ class Case:
       group: part of the table.
       what: the mistake, in words.
       command: what the user types after `limsim-jax`; several are joined by " && ".
-      says: pattern that the last line has to match.
+      says: pattern that a line has to match, the last one if there are several.
       code: exit code.
       files: names and contents.
       runs: it drives worlds, and takes half a minute.
@@ -124,6 +124,22 @@ SWEEP = "sweep a.toml --seeds 6 --no-report"
 
 CASES = (
     experiment("a field that does not exist", "horizn: no such field", ("horizon = 3.0", "horizn = 3.0")),
+    experiment("a view with a negative range", "view.range: -3 m", ("[ego]", "[ego]\nview = { range = -3 }")),
+    experiment(
+        "a view with an unknown field",
+        "ego.view: rnge: no such field",
+        ("[ego]", "[ego]\nview = { rnge = 3 }"),
+    ),
+    experiment(
+        "a share of misses above 1",
+        "view.misses: 1.5; .*0 and 1",
+        ("[ego]", "[ego]\nview = { misses = 1.5 }"),
+    ),
+    experiment(
+        "a latency between two decisions",
+        "ego.view: view.latency: 0.7 s; expected a multiple of 0.5 s",
+        ("[ego]", "[ego]\nview = { latency = 0.7 }"),
+    ),
     experiment("no map", "map: Field required", ('map = "highway"\n', "")),
     experiment("a map that does not exist", "bundled maps are", ('"highway"', '"higway"')),
     experiment(
@@ -283,6 +299,33 @@ CASES = (
     Case("Commands", "no seeds", "sweep highway --seeds 0", "0; between 1 and 2.31"),
     Case("Commands", "a shard that is none", "sweep highway --shard 3/2", "is not I/N with I below N"),
     Case(
+        "Experiment files",
+        "a speed in km/h: it runs, and is said",
+        "sweep a.toml --seeds 4 --no-report",
+        "ego.v: 120 m/s, but the highest limit of the map is 33.3 m/s; 120 km/h are 33.3 m/s",
+        code=0,
+        files={
+            "a.toml": small(("[ego]", "[ego]\nv = 120.0"), ("mine:Mine", "like_traffic")),
+            "mine.py": mine(),
+        },
+        runs=True,
+    ),
+    Case(
+        "Experiment files",
+        "a demand that the roads do not take",
+        "sweep a.toml --seeds 4 --no-report",
+        "vehicles per episode were still outside at the end; the roads took no more",
+        code=0,
+        files={
+            "a.toml": small(
+                ("vehicles = 8", "vehicles = 8\nflow = [{ rate = 90000 }]"),
+                ("mine:Mine", "like_traffic"),
+                ("slots = 12", "slots = 128"),
+            )
+        },
+        runs=True,
+    ),
+    Case(
         "Commands",
         "`--fresh` for one shard of several",
         "sweep highway --shard 0/2 --fresh",
@@ -307,6 +350,29 @@ CASES = (
         "a metric for `--until-ci` that does not exist",
         "sweep highway --until-ci 0.1:sucess",
         "no metric 'sucess'; did you mean 'success'",
+    ),
+    Case(
+        "Recordings",
+        "a leader behind its follower in one row: the stretch is lost",
+        "calibrate a.csv --length 4.5",
+        "line 52, column x_lead: leader leader is 30.0 m behind its follower",
+        code=0,
+        files={"a.csv": GPS.replace("5.0,50,10,80,", "5.0,50,10,20,").replace("\\n", "\n")},
+        runs=True,
+    ),
+    Case(
+        "Recordings",
+        "the same with `--tolerated 0`",
+        "calibrate a.csv --length 4.5 --tolerated 0",
+        "so are 1 of 400 rows, and at most 0 % are tolerated",
+        files={"a.csv": GPS.replace("5.0,50,10,80,", "5.0,50,10,20,").replace("\\n", "\n")},
+    ),
+    Case(
+        "Recordings",
+        "leader and follower mixed up",
+        "calibrate a.csv --length 4.5 --columns x=x_lead,x_lead=x",
+        "so are 400 of 400 rows",
+        files={"a.csv": GPS.replace("\\n", "\n")},
     ),
     Case(
         "Recordings",
@@ -349,7 +415,7 @@ CASES = (
 
 
 def typed(case: Case) -> tuple[int, str, list[str]]:
-    """Type the commands of a case: the last exit code, the last line, and all lines of standard error."""
+    """Type the commands of a case: the last exit code, what it says, and all lines of standard error."""
     with tempfile.TemporaryDirectory() as folder:
         for name, text in case.files.items():
             Path(folder, name).write_text(text)
@@ -365,7 +431,8 @@ def typed(case: Case) -> tuple[int, str, list[str]]:
             )
     lines = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip()]
     errors = [line for line in done.stderr.splitlines() if line.strip()]
-    return done.returncode, lines[-1].replace(folder, "FOLDER") if lines else "", errors
+    told = [line for line in lines if re.search(case.says, line)] or lines or [""]
+    return done.returncode, told[-1].replace(folder, "FOLDER"), errors
 
 
 def main() -> None:

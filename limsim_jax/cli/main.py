@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Sequence
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
@@ -37,7 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from limsim_jax.maps.network import MapError
 
     try:
-        code = app(args=arguments, prog_name="limsim-jax", standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            code = app(args=arguments, prog_name="limsim-jax", standalone_mode=False)
     except typer.TyperException as error:  # an unknown command, a missing argument, a bad option
         return _refuse(error.format_message())
     except MapError as error:
@@ -65,6 +69,13 @@ def _is_ours(error: ValueError) -> bool:
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
     return trace is not None and str(trace.tb_frame.f_globals.get("__name__")).startswith("limsim_jax.")
+
+
+def _show_warning(message: Warning | str, category: type[Warning], filename: str, *rest: Any) -> None:
+    """Our own warnings as a line, others as Python writes them."""
+    own = category is UserWarning and Path(__file__).parents[1] in Path(filename).parents
+    text = f"limsim-jax: {message}\n" if own else warnings.formatwarning(message, category, filename, rest[0])
+    sys.stderr.write(text)
 
 
 def _refuse(reason: str) -> int:

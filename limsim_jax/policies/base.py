@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Key
 
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.predict import Predictor
-from limsim_jax.policies.view import View
+from limsim_jax.policies.view import View, view_of
 from limsim_jax.traffic.command import Command
 from limsim_jax.types import Config, State
 
@@ -201,6 +201,13 @@ def sighted(policy: PolicyLike) -> PolicyLike:
     return _Sighted(policy, view=getattr(policy, "view", View()), privileged=True)
 
 
+def views(policy: Any) -> list[View]:
+    """The views of a policy and of the policies in it."""
+    inner = [getattr(policy, name, None) for name in ("policy", "around", "ego")]
+    found = [view for one in inner if isinstance(one, PolicyLike) for view in views(one)]
+    return found if getattr(policy, "privileged", False) else [*found, getattr(policy, "view", View())]
+
+
 def knows(policy: Any) -> str:
     """What a policy knows of other vehicles: "state" or "view"."""
     told = getattr(policy, "knows", None)
@@ -289,6 +296,8 @@ def build_policy(factory: Callable[..., PolicyLike], options: Mapping[str, Any])
     for name in options:
         if name not in takes and not anything:
             raise ValueError(f"{name}: no such option; there are {', '.join(takes) or 'none'}")
+    if isinstance(options.get("view"), Mapping):  # as a file has it
+        options = {**options, "view": view_of(options["view"])}
     return factory(**options)
 
 

@@ -283,8 +283,9 @@ def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = 
         if any(cells):
             label = f"{main.label}, {main.unit}" if main.unit else main.label
             rows.append([label, *cells])
-    notes = [_causes_note(group, part, several) for group, part in groups(results).items()]
-    notes = [note for note in notes if note]
+    parts = groups(results)
+    notes = [_causes_note(group, part, several) for group, part in parts.items()]
+    notes = [note for note in notes if note] + demand_notes(parts)
     notes += [
         f"Brackets: {100 * level:g} % intervals over seeds: Wilson for shares, BCa bootstrap for means, "
         "exact for rates and medians."
@@ -296,6 +297,26 @@ def headline(results: Results, *, level: float = 0.95, table: pa.Table | None = 
             f"At least, at most: one-sided {100 * level:g} % bounds for what happened in all or none."
         )
     return TextTable(header, rows, notes)
+
+
+_OUTSIDE = 0.02  # share of the vehicles still outside, from which on it is said
+
+
+def demand_notes(parts: Mapping[Group, pa.Table]) -> list[str]:
+    """Scenarios whose roads or slots did not take the demand."""
+    notes = {}
+    for (scenario, _), part in parts.items():
+        names = ["traffic_entered", "traffic_waiting", "traffic_full"]
+        if scenario in notes or not set(names) <= set(part.column_names):
+            continue
+        entered, waiting, full = np.nanmean(columns(part, names), 0)
+        if waiting > _OUTSIDE * (entered + waiting):
+            why = "all slots were taken: more `slots` let them in" if full else "the roads took no more"
+            notes[scenario] = (
+                f"{scenario}: {waiting:,.0f} of {entered + waiting:,.0f} vehicles per episode were still "
+                f"outside at the end; {why}."
+            )
+    return list(notes.values())
 
 
 KNOWS = "knows of other vehicles"

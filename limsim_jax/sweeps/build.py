@@ -45,6 +45,8 @@ MODELS: dict[str, Callable[[], Any]] = {
 }
 """Car-following models by their names in experiment files."""
 
+_FAR_TOO_FAST = 1.5  # times the highest limit, above which a speed is probably in km/h
+
 ROADS_OF_A_CLOSED_MAP = 12
 """Roads, at most, on which traffic comes into a map without origins."""
 
@@ -207,6 +209,20 @@ def _start_lane(name: str, ego: EgoTable, network: Network) -> str:
     if not chosen.drivable or chosen.junction is not None:
         raise ExperimentError(f"{name}: ego.start: lane '{chosen.id}' is no lane to start on")
     return chosen.id
+
+
+def doubts(experiment: ExperimentFile, town: Map) -> list[str]:
+    """What runs but is hardly meant, a line each: speeds far above every limit of the map."""
+    limit = max((float(x) for x in town.lanes.speed_limit[town.lanes.valid]), default=0.0)
+    flows = enumerate(experiment.traffic.flow)
+    speeds = [("ego.v", ego.v) for ego in experiment.ego]
+    speeds += [(f"traffic.flow.{k}.speed", flow.speed) for k, flow in flows]
+    return [
+        f"{experiment.name}: {field}: {v:g} m/s, but the highest limit of the map is {limit:.1f} m/s; "
+        f"{v:g} km/h are {v / 3.6:.1f} m/s"
+        for field, v in dict(speeds).items()
+        if v is not None and v > _FAR_TOO_FAST * limit
+    ]
 
 
 def population_of(experiment: ExperimentFile, drivers: Population | None = None) -> Population:

@@ -8,6 +8,7 @@ import importlib
 import math
 import os
 import platform
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property
@@ -29,7 +30,7 @@ from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos, EvaluateTraffic
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.policies.area import PARTS
-from limsim_jax.policies.base import PolicyLike, check_policy, knows, policy_name
+from limsim_jax.policies.base import PolicyLike, check_policy, knows, policy_name, views
 from limsim_jax.policies.host import failure_reasons
 from limsim_jax.simulation.ending import Watch
 from limsim_jax.simulation.rollout import Rollout, decision_key
@@ -38,6 +39,7 @@ from limsim_jax.simulation.trace import trace
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweeps.build import (
     demand_of,
+    doubts,
     egos_of,
     flows_of,
     map_of,
@@ -108,8 +110,11 @@ class Episodes:
         self.units = self._units()
         self._check_success()
         self._demand = demand_of(experiment, self.town, self._egos, drivers)
+        for doubt in doubts(experiment, self.town):
+            warnings.warn(doubt, stacklevel=2)
         self._check_room()
         config = Config(dt=experiment.dt, decision_every=experiment.decision_every)
+        self._check_views(config)
         behaviour = traffic_of(experiment, model)
         self.rollout = Rollout(config, behaviour, experiment.horizon, self._policy, measure=self._measure)
         self._code = self._check_policy()
@@ -197,6 +202,13 @@ class Episodes:
             starts = "a random start needs" if one else f"{self.egos} random starts need"
             needed = "one vehicle" if one else f"{self.egos} vehicles"
             self._refuse("traffic.density", f"{starts} at least {needed} at the start")
+
+    def _check_views(self, config: Config) -> None:
+        for view in views(self._policy):
+            try:
+                view.late(config)
+            except ValueError as error:
+                self._refuse("ego.view", str(error))
 
     def _check_policy(self) -> dict[str, Any] | None:
         """The code of a policy of one's own.

@@ -25,7 +25,8 @@ from limsim_jax.policies.view.drivers import (
     watch,
 )
 from limsim_jax.policies.view.routes import TURN, TURN_WITHIN, believed_goals
-from limsim_jax.sweeps.build import policy_of
+from limsim_jax.sweeps.build import doubts, map_of, policy_of
+from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import ExperimentError, read_experiments
 from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import from_lane
@@ -427,3 +428,19 @@ def test_a_file_says_what_its_policy_sees(tmp_path):
     area = policy_of(read_experiments(file)[0])
     assert isinstance(area, AreaOfInterest) and isinstance(area.around, LimSimTM)
     assert area.around.view.occlusion and area.around.privileged and knows(area) == "state"
+
+
+def test_a_latency_between_decisions_and_a_speed_in_km_h_are_told(tmp_path):
+    file = tmp_path / "mine.toml"
+    text = 'map = "ramp"\nhorizon = 20\nego = { policy = "POLICY", view = { latency = 0.7 } }\n'
+    text += "[traffic]\nvehicles = 4\n"
+    for policy in ("limsim_tm", "area_of_interest"):
+        file.write_text(text.replace("POLICY", policy))
+        with pytest.raises(ExperimentError, match=r"ego\.view: view\.latency: 0\.7 s; expected a mult"):
+            Episodes(read_experiments(file)[0])
+    town = map_of(read_experiments("ramp")[0])
+    file.write_text('map = "ramp"\nhorizon = 20\n[ego]\nv = 120\n[[traffic.flow]]\nrate = 400\nspeed = 30\n')
+    told = doubts(read_experiments(file)[0], town)
+    assert told == [
+        "mine: ego.v: 120 m/s, but the highest limit of the map is 33.3 m/s; 120 km/h are 33.3 m/s"
+    ]

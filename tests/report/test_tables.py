@@ -270,3 +270,32 @@ def test_tables_print_in_columns_and_show_as_html():
     assert repr(table) == str(table)
     html = table._repr_html_()
     assert "<th" in html and "a &lt; b" in html and html.endswith("<div>a note</div>")
+
+
+def test_a_demand_that_does_not_fit_is_told():
+    def worlds(entered, waiting, full):
+        counts = {"traffic_entered": entered, "traffic_waiting": waiting, "traffic_full": full}
+        return {name: np.asarray(x, float) for name, x in counts.items()}
+
+    found = made(
+        {
+            ("highway", "a"): worlds([100, 120], [310, 290], [0, 0]),
+            ("highway", "b"): worlds([100, 120], [310, 290], [0, 0]),
+            ("ramp", "a"): worlds([50, 50], [30, 40], [9, 0]),
+            ("town", "a"): worlds([500, 500], [4, 6], [0, 0]),
+        }
+    )
+    told = [note for note in headline(found).notes if "outside" in note]
+    assert told == [
+        "highway: 300 of 410 vehicles per episode were still outside at the end; the roads took no more.",
+        "ramp: 35 of 85 vehicles per episode were still outside at the end; all slots were taken: more "
+        "`slots` let them in.",
+    ]
+
+
+def test_the_table_says_what_a_policy_knows():
+    worlds = {("ramp", name): {"mean_speed": [9.0, 8.0]} for name in ("a", "b", "c")}
+    told = {("ramp", "a"): {"knows": "state"}, ("ramp", "b"): {"knows": "view"}}
+    found = headline(made(worlds, provenance=told))
+    assert found.rows[1] == ["knows of other vehicles", "all", "what it sees", ""]
+    assert headline(made(worlds)).rows[1][0] != "knows of other vehicles"
