@@ -465,6 +465,7 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
     import numpy as np
     from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+    from limsim_jax.policies.base import sighted
     from limsim_jax.simulation.rollout import started
     from limsim_jax.simulation.worlds import over_worlds
     from limsim_jax.sweeps.episode import Episodes
@@ -477,6 +478,7 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
     (read,) = read_experiments(experiment, policy=options["policy"])
     episodes = Episodes(read)
     run, lane_map = episodes.rollout, episodes.lane_map
+    policy = sighted(run.policy)
     devices = jax.local_devices()[: options["worlds"]]
     worlds = -(-options["worlds"] // len(devices)) * len(devices)
     mesh = Mesh(np.array(devices), ("worlds",))
@@ -487,7 +489,7 @@ def _policy(experiment: str, told: str) -> dict[str, Any]:
         return world.carry.state, world.carry.memory, world.key
 
     def decide(lane_map: Any, world: Any) -> Any:
-        return run.policy(run.config, lane_map, *world)
+        return policy(run.config, lane_map, *world)
 
     begun = over_worlds(begin, mesh, run_once())(lane_map, jnp.arange(worlds, dtype=jnp.int32))
     jax.block_until_ready(begun)

@@ -222,6 +222,7 @@ class _Commanded:
     free: bool
     name = "env"
     others = 0
+    privileged = True  # it does not look
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
         del config, lane_map, state

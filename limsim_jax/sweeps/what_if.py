@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Int
 
 from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.policies.base import sighted
 from limsim_jax.simulation.rollout import Result, Started
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.traffic.ego import hand_over
@@ -85,7 +86,7 @@ def futures(
         if change is not None:
             state = change(state, copy)
         if not same:
-            memory = run.policy.init(run.config, lane_map, state)
+            memory = sighted(run.policy).init(run.config, lane_map, state)
         return world._replace(carry=run.restart(lane_map, state, memory))
 
     count = len(begun.carry.state.step)

@@ -1,6 +1,7 @@
 """What a planner may know: nothing that cannot be seen leaks in, and sensors err as they are told to."""
 
 import dataclasses
+import functools
 from dataclasses import replace
 
 import jax
@@ -66,15 +67,29 @@ def mine(state):
 # --- routes ------------------------------------------------------------------------------------------
 
 
-def expected_lanes(lane_map, state, signals, distance):
-    """By loops: the lane after the next split that a prudent driver expects of each vehicle; -2: no split."""
+@functools.cache
+def tables(name):
+    """The map on the host, and the headings at the end of every lane and 30 m into it."""
+    lane_map = bundled(name)[1]
     m = jax.tree.map(np.asarray, lane_map)
-    own, lane = [], int(state.lane[EGO])
+    lanes = np.arange(len(m.length))
+    ends = np.asarray(pose(lane_map, lanes, m.length)[2])
+    within = np.asarray(pose(lane_map, lanes, np.minimum(m.length, TURN_WITHIN))[2])
+    return m, ends, within
+
+
+def expected_lanes(name, state, signals, distance, ego=EGO):
+    """By loops: the split ahead of each vehicle, and the lane behind it that a prudent driver expects.
+
+    -2: there is no split. Also how many of these are not the straightest.
+    """
+    m, ends, within = tables(name)
+    own, lane = [], int(state.lane[ego])
     for _ in range(6):
         if lane != NO_LANE:
             own.append(lane)
-            lane = int(m.routes.next_lane[lane, int(state.goal[EGO])])
-    found = []
+            lane = int(m.routes.next_lane[lane, int(state.goal[ego])])
+    found, bent = [], 0
     for i in range(state.lane.shape[0]):
         lane, goal = int(state.lane[i]), int(state.goal[i])
         room = m.length[lane] - float(state.s[i])
@@ -90,24 +105,23 @@ def expected_lanes(lane_map, state, signals, distance):
             continue
 
         def turn(x, lane=lane):
-            end = float(pose(lane_map, lane, m.length[lane])[2])
-            turned = float(pose(lane_map, x, min(m.length[x], TURN_WITHIN))[2]) - end
-            return (turned + np.pi) % (2 * np.pi) - np.pi
+            return (within[x] - ends[lane] + np.pi) % (2 * np.pi) - np.pi
 
         def side(x, turn=turn):
-            return (turn(x) > TURN) - (turn(x) < -TURN)
-
-        true = int(m.routes.next_lane[lane, goal])
-        if signals and room < distance and true in after:
-            after = [x for x in after if side(x) == side(true)]
+            return int(turn(x) > TURN) - int(turn(x) < -TURN)
 
         def meets(x):
             row = m.conflicts.connector[x]
             foes = {int(m.conflicts.lane[f]) for f in m.conflicts.foe[row] if f >= 0} if row >= 0 else set()
             return x in own or bool(foes & set(own))
 
-        found.append((lane, max(after, key=lambda x: (meets(x), -abs(turn(x))))))
-    return found
+        true = int(m.routes.next_lane[lane, goal])
+        if signals and room < distance and true in after:
+            after = [x for x in after if side(x) == side(true)]
+        best = max(after, key=lambda x, turn=turn: (meets(x), -abs(turn(x))))
+        bent += i != ego and best != min(after, key=lambda x, turn=turn: abs(turn(x)))
+        found.append((lane, best))
+    return found, bent
 
 
 @pytest.mark.parametrize("name", ["roundabout", "intersection"])
@@ -116,19 +130,34 @@ def test_routes_are_those_of_a_prudent_driver(name):
     ask = jax.jit(
         lambda s, on: believed_goals(lane_map, s, jnp.arange(N) == EGO, jnp.full(N, on), 40.0),
     )
-    next_lane = np.asarray(lane_map.routes.next_lane)
+    next_lane = tables(name)[0].routes.next_lane
     splits = differ = 0
     for seed in range(4):
         state = world(name, seed)
         for on in (True, False):
             goal = np.asarray(ask(state, on))
             assert goal[EGO] == state.goal[EGO]
-            for i, (lane, wanted) in enumerate(expected_lanes(lane_map, state, on, 40.0)):
+            for i, (lane, wanted) in enumerate(expected_lanes(name, state, on, 40.0)[0]):
                 if i != EGO and wanted != -2:
                     assert next_lane[lane, goal[i]] == wanted, (seed, on, i)
                     splits += 1
                     differ += next_lane[lane, int(state.goal[i])] != wanted
     assert splits > 20 and differ > 5  # it is a belief, not the truth
+
+
+def test_prudence_expects_the_branch_that_meets_the_ego():
+    states = at_entries()[0]
+    lane_map, next_lane = bundled("roundabout")[1], tables("roundabout")[0].routes.next_lane
+    mine, off = jnp.asarray([True, False]), jnp.zeros(2, bool)
+    goals = jax.jit(jax.vmap(lambda s: believed_goals(lane_map, s, mine, off, 40.0)))(states)
+    bent = 0
+    for k, goal in enumerate(np.asarray(goals)):
+        state = jax.tree.map(lambda x: x[k], states)  # noqa: B023
+        found, more = expected_lanes("roundabout", state, False, 40.0, ego=0)
+        lane, wanted = found[1]
+        assert next_lane[lane, goal[1]] == wanted
+        bent += more
+    assert bent > 3
 
 
 # --- drivers -----------------------------------------------------------------------------------------

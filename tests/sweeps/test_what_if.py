@@ -46,8 +46,9 @@ def rows(worlds, which):
 
 def test_a_stopped_world_goes_on_as_in_the_sweep(episodes, now):
     both = rows(now[0], [1, 1])
-    speed, count = both.carry.memory.policy
-    memory = both.carry.memory._replace(policy=(speed.at[1].mul(0.2), count))
+    seen = both.carry.memory.policy  # with what the view remembers
+    speed, count = seen.policy
+    memory = both.carry.memory._replace(policy=seen._replace(policy=(speed.at[1].mul(0.2), count)))
     both = both._replace(carry=both.carry._replace(memory=memory))
     found = futures(episodes, both, 12, same=True)
     whole = episodes.replay(SEED)
@@ -65,7 +66,7 @@ def test_times_are_rounded_to_decisions(now):
 
 def test_policies_remember_and_totals_begin_anew(episodes, now):
     worlds, _ = now
-    np.testing.assert_array_equal(worlds.carry.memory.policy[1], [0, 8, 5])
+    np.testing.assert_array_equal(worlds.carry.memory.policy.policy[1], [0, 8, 5])
     found = futures(episodes, worlds, 2, same=True)
     assert 0 < found.totals.time.max() <= 8.01  # s, of 8 vehicles in 1 s
 
