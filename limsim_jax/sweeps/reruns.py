@@ -171,7 +171,7 @@ class Reruns:
         run = self.rollout
         assert run.measure is not None
         other = variants(run.policy, Replayed(box, run.config.dt))[module]
-        carry = world.carry._replace(memory=other.init(run.config, lane_map, world.carry.state))
+        carry = world.carry._replace(memory=sighted(other).init(run.config, lane_map, world.carry.state))
         run = replace(run, policy=other)
         return run.advance(lane_map, world.schedule, world.key, carry, more)[0].measures
 
