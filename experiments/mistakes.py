@@ -118,7 +118,22 @@ def policy(what: str, says: str, text: str = SMALL, **changes: str) -> Case:
     return Case(group, what, "sweep a.toml --seeds 4 --no-report", says, files=files)
 
 
-GPS = "time,x,v,x_lead,v_lead\\n" + "\\n".join(f"{0.1 * k:.1f},{k},10,{k + 30},10" for k in range(400))
+def recording(
+    what: str,
+    says: str,
+    change: tuple[str, str] = ("", ""),
+    options: str = "",
+    *,
+    code: int = 2,
+    runs: bool = False,
+) -> Case:
+    """A mistake in a recording, or in how it is calibrated."""
+    command = " ".join(filter(None, ["calibrate a.csv --length 4.5", options]))
+    return Case("Recordings", what, command, says, code, {"a.csv": GPS.replace(*change, 1)}, runs)
+
+
+GPS = "time,x,v,x_lead,v_lead\n" + "\n".join(f"{0.1 * k:.1f},{k},10,{k + 30},10" for k in range(400))
+BEHIND = ("5.0,50,10,80,", "5.0,50,10,20,")
 HOST = small(("mine:Mine", "mine:host"))
 SWEEP = "sweep a.toml --seeds 6 --no-report"
 
@@ -351,28 +366,23 @@ CASES = (
         "sweep highway --until-ci 0.1:sucess",
         "no metric 'sucess'; did you mean 'success'",
     ),
-    Case(
-        "Recordings",
+    recording(
         "a leader behind its follower in one row: the stretch is lost",
-        "calibrate a.csv --length 4.5",
         "line 52, column x_lead: leader leader is 30.0 m behind its follower",
+        BEHIND,
         code=0,
-        files={"a.csv": GPS.replace("5.0,50,10,80,", "5.0,50,10,20,").replace("\\n", "\n")},
         runs=True,
     ),
-    Case(
-        "Recordings",
+    recording(
         "the same with `--tolerated 0`",
-        "calibrate a.csv --length 4.5 --tolerated 0",
         "so are 1 of 400 rows, and at most 0 % are tolerated",
-        files={"a.csv": GPS.replace("5.0,50,10,80,", "5.0,50,10,20,").replace("\\n", "\n")},
+        BEHIND,
+        "--tolerated 0",
     ),
-    Case(
-        "Recordings",
+    recording(
         "leader and follower mixed up",
-        "calibrate a.csv --length 4.5 --columns x=x_lead,x_lead=x",
         "so are 400 of 400 rows",
-        files={"a.csv": GPS.replace("\\n", "\n")},
+        options="--columns x=x_lead,x_lead=x",
     ),
     Case(
         "Recordings",
@@ -381,29 +391,15 @@ CASES = (
         "a.csv: .*(column|kind)",
         files={"a.csv": "time,x\n0,1\n"},
     ),
-    Case(
-        "Recordings",
-        "a value that is not a number",
-        "calibrate a.csv",
-        "a.csv: line 4, column v",
-        files={"a.csv": GPS.replace("0.2,2,10", "0.2,2,nan").replace("\\n", "\n")},
-    ),
-    Case(
-        "Recordings",
+    recording("a value that is not a number", "a.csv: line 4, column v", ("0.2,2,10", "0.2,2,nan")),
+    recording(
         "a time that is mistyped: the stretch is lost",
-        "calibrate a.csv --length 4.5",
         "line 5, column time: 0.2 s are missing before this row",
+        ("0.2,2,", "0.05,2,"),
         code=0,
-        files={"a.csv": GPS.replace("0.2,2,", "0.05,2,").replace("\\n", "\n")},
         runs=True,
     ),
-    Case(
-        "Recordings",
-        "a recording that is too short",
-        "calibrate a.csv --length 4.5",
-        "a.csv|shortest",
-        files={"a.csv": "\n".join(GPS.replace("\\n", "\n").splitlines()[:50])},
-    ),
+    recording("a recording that is too short", "a.csv.*--shortest", (GPS, "\n".join(GPS.splitlines()[:50]))),
     Case("Maps", "a file that is no map", "map info a.xodr", "a.xodr", files={"a.xodr": "<OpenDRIVE"}),
     Case(
         "Maps",

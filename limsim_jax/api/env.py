@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Key
 from limsim_jax.api.experiment import Experiment
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.host import Kind, Observation, Observe, command_from
+from limsim_jax.policies.view import view_of
 from limsim_jax.simulation.rollout import Carry, Rollout
 from limsim_jax.sweeps.experiment import ExperimentError
 from limsim_jax.traffic.command import Command
@@ -30,6 +31,7 @@ class EnvState:
 
     carry: Carry
     schedule: Schedule
+    sight: Any  # what the view of the egos remembers, None without one
     key: Key[Array, ""]  # of the world
     ended: Array  # [E], the ego has collided, left the road or arrived, or its action was broken
 
@@ -95,7 +97,7 @@ class Env:
     ended, its reward is 0.
 
     Observations are those of `policies.host.Observation`, actions those of `HostPolicy`, for one world:
-    leaves `[E, ...]` for `E` egos.
+    leaves `[E, ...]` for `E` egos. The egos see by the `view` of the experiment unless it says `privileged`.
 
     - "control": `acceleration` (m/s^2) and `steering` (rad), `[E]`;
     - "trajectory": `x`, `y` (m), `heading` (rad), `v` (m/s), `[E, samples]`, in the frame of the ego, every
@@ -107,13 +109,13 @@ class Env:
     Args:
       experiment: with at least one ego; an `Experiment`, a name or a file.
       action: kind of the actions.
-      observe: makes the observation; any `(config, lane_map, state) -> pytree`.
+      observe: makes the observation of what the egos see; any `(config, lane_map, state) -> pytree`.
       reward: from two `Info`s to a reward per ego.
       sample_time: s between samples of trajectories.
 
     Raises:
       ExperimentError: an experiment that cannot run or has no ego.
-      ValueError: an unknown kind of action.
+      ValueError: an unknown kind of action, or a latency that is not a whole number of decisions.
     """
 
     def __init__(
@@ -134,12 +136,16 @@ class Env:
         self.sample_time = sample_time
         self.observe = Observe() if observe is None else observe
         self.reward: Reward = ProgressReward() if reward is None else reward
+        ego = self.experiment.file.ego[0]
+        self._view = None if ego.privileged else view_of(ego.view)
         driver = _Commanded(action != "meta")
         self._episodes: Episodes = self.experiment.episodes(driver, chunk=1)
         self.lanes = self._episodes.lane_map
         self.egos = self._episodes.egos
         self._run: Rollout = replace(self._episodes.rollout, policy=driver, measure=None, record=None)
         self.config = self._run.config
+        if self._view is not None:
+            self._view.late(self.config)
 
     @property
     def horizon(self) -> int:
@@ -160,8 +166,11 @@ class Env:
         start = scenario.start
         empty = Command()
         carry = self._run.init(self.lanes, start)._replace(memory=empty)
-        state = EnvState(carry=carry, schedule=scenario.schedule, key=own, ended=jnp.zeros(self.egos, bool))
-        return self.observe(self.config, self.lanes, carry.state), state
+        sight = None if self._view is None else self._view.init(self.config, carry.state)
+        seen, sight = self._look(carry.state, sight, own)
+        nothing = jnp.zeros(self.egos, bool)
+        state = EnvState(carry=carry, schedule=scenario.schedule, sight=sight, key=own, ended=nothing)
+        return seen, state
 
     def step(
         self, key: Key[Array, ""], state: EnvState, action: dict[str, Any]
@@ -186,9 +195,16 @@ class Env:
         over = state.ended | now.collided | now.off_road | now.arrived | now.broken
         reward = jnp.where(state.ended, 0.0, self.reward(last, now))
         truncated = after.state.step >= self._run.decisions * self.config.decision_every
-        new = EnvState(carry=after, schedule=state.schedule, key=state.key, ended=over)
-        observation = self.observe(self.config, self.lanes, after.state)
-        return observation, new, reward, over, truncated, now
+        seen, sight = self._look(after.state, state.sight, state.key)
+        new = EnvState(carry=after, schedule=state.schedule, sight=sight, key=state.key, ended=over)
+        return seen, new, reward, over, truncated, now
+
+    def _look(self, state: State, sight: Any, key: Key[Array, ""]) -> tuple[Any, Any]:
+        """The observation of the egos, and the memory of their view."""
+        if self._view is not None:
+            now = jax.random.fold_in(key, state.step)
+            state, sight = self._view.look(self.config, self.lanes, state, sight, now)
+        return self.observe(self.config, self.lanes, state), sight
 
     def _info(self, before: State, after: State) -> Info:
         """Of the egos, between two states."""

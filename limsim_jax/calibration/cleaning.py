@@ -154,7 +154,8 @@ def segments(
         why = ", ".join(f"{reason}: {seconds:.0f} s" for reason, seconds in quality.dropped.items())
         raise RecordingError(
             f"{r.source}: {r.row} {r.line[0]}: no vehicle follows a leader for {shortest:g} s; of "
-            f"{quality.recorded:.0f} s recorded were dropped: {why or 'none'}"
+            f"{quality.recorded:.0f} s recorded were dropped: {why or 'none'}; a smaller `shortest` "
+            "(--shortest) admits short stretches"
         )
     quality.kept = sum(segment.duration for segment in found)
     quality.segments = len(found)

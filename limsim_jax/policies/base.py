@@ -71,7 +71,7 @@ class Policy(ABC):
     """
 
     name: str | None = field(default=None, kw_only=True)
-    view: View = field(default_factory=View, kw_only=True)
+    view: View = field(default=View(), kw_only=True)
     privileged: bool = field(default=False, kw_only=True)
 
     free = True
@@ -196,7 +196,7 @@ def sighted(policy: PolicyLike) -> PolicyLike:
 
     A policy without a `view` gets the default one.
     """
-    if getattr(policy, "privileged", False) or isinstance(policy, _Sighted):
+    if getattr(policy, "privileged", False):
         return policy
     return _Sighted(policy, view=getattr(policy, "view", View()), privileged=True)
 
@@ -248,26 +248,32 @@ def named(name: str, policy: Any) -> Any:
     _checked_name(name)
     if is_dataclass(policy) and any(f.name == "name" and f.init for f in fields(policy)):
         return replace(policy, name=name)  # pyright: ignore[reportArgumentType]
-    return seeing(Wrapper(policy, name=name), like=policy)  # pyright: ignore[reportArgumentType]
+    return _wrapped(policy, name)
 
 
-def seeing(policy: Any, *, view: View | None = None, privileged: bool | None = None, like: Any = None) -> Any:
+def _wrapped(policy: Any, name: str) -> Wrapper:
+    """The policy with fields `name`, `view` and `privileged`."""
+    view, privileged = getattr(policy, "view", View()), getattr(policy, "privileged", False)
+    return Wrapper(policy, name=name, view=view, privileged=privileged)
+
+
+def seeing(policy: Any, *, view: View | None = None, privileged: bool | None = None) -> Any:
     """The same policy with another view, or with the state.
 
     Args:
       policy: any policy.
-      view: what it sees; None: as `like`.
-      privileged: whether it gets the state; None: as `like`.
-      like: a policy that sees the same; None: `policy` itself.
+      view: what it sees; None: as now.
+      privileged: whether it gets the state; None: as now.
     """
-    if like is None and callable(own := getattr(policy, "seeing", None)):
+    if callable(own := getattr(policy, "seeing", None)):
         return own(view, privileged)
-    like = policy if like is None else like
-    view = getattr(like, "view", View()) if view is None else view
-    privileged = getattr(like, "privileged", False) if privileged is None else privileged
-    if not is_dataclass(policy) or not {"view", "privileged"} <= {f.name for f in fields(policy)}:
-        policy = Wrapper(policy, name=policy_name(policy))  # pyright: ignore[reportArgumentType]
-    return replace(policy, view=view, privileged=privileged)  # pyright: ignore[reportArgumentType]
+    if not isinstance(policy, Policy):
+        policy = _wrapped(policy, policy_name(policy))
+    return replace(
+        policy,  # pyright: ignore[reportArgumentType]
+        view=policy.view if view is None else view,
+        privileged=policy.privileged if privileged is None else privileged,
+    )
 
 
 def snake_case(name: str) -> str:

@@ -45,21 +45,13 @@ def _by_name(policy: str | PolicyLike, options: Mapping[str, Any]) -> PolicyLike
     return build_policy(POLICIES[policy], options)
 
 
-def pdm_closed_rules(seen: int = 32) -> PDMClosed:
-    """`PDMClosed` that gives way as the map demands.
+def _preset(factory: Callable[..., PolicyLike], **preset: Any) -> Callable[..., PolicyLike]:
+    """The factory with some options set; it takes the others as before."""
 
-    Raises:
-      ValueError: no other vehicle is seen.
-    """
-    return PDMClosed(seen=seen, rules=True)
+    def build(**options: Any) -> PolicyLike:
+        return build_policy(factory, preset | options)
 
-
-def limsim_tm_privileged(**options: Any) -> PolicyLike:
-    """`LimSimTM` that knows the routes and drivers of all vehicles.
-
-    `options` are those of `LimSimTM`.
-    """
-    return build_policy(LimSimTM, {"name": "limsim_tm_privileged", **options, "privileged": True})
+    return build
 
 
 POLICIES: dict[str, Callable[..., PolicyLike]] = {
@@ -67,10 +59,10 @@ POLICIES: dict[str, Callable[..., PolicyLike]] = {
     "constant_speed": ConstantSpeed,
     "follow_lane": FollowLane,
     "pdm_closed": PDMClosed,
-    "pdm_closed_rules": pdm_closed_rules,
+    "pdm_closed_rules": _preset(PDMClosed, rules=True),
     "pdm_hybrid": PDMHybrid,
     "limsim_tm": LimSimTM,
-    "limsim_tm_privileged": limsim_tm_privileged,
+    "limsim_tm_privileged": _preset(LimSimTM, privileged=True, name="limsim_tm_privileged"),
     "area_of_interest": area_of_interest,
 }
 """Factories by name; other policies are named by module and factory, `package.module:factory`."""

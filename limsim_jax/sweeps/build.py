@@ -213,7 +213,7 @@ def _start_lane(name: str, ego: EgoTable, network: Network) -> str:
 
 def doubts(experiment: ExperimentFile, town: Map) -> list[str]:
     """What runs but is hardly meant, a line each: speeds far above every limit of the map."""
-    limit = max((float(x) for x in town.lanes.speed_limit[town.lanes.valid]), default=0.0)
+    limit = max(lane.speed_limit for lane in town.network.drivable_lanes())
     flows = enumerate(experiment.traffic.flow)
     speeds = [("ego.v", ego.v) for ego in experiment.ego]
     speeds += [(f"traffic.flow.{k}.speed", flow.speed) for k, flow in flows]

@@ -180,6 +180,18 @@ def test_an_environment_steps_and_batches():
     np.testing.assert_array_equal(np.asarray(alone.v), np.asarray(before.v[1]))
 
 
+def test_an_environment_shows_what_the_ego_sees():
+    def there(**ego):
+        ego = lj.Ego(start="1-", s=40.0, goal="3+", v=8.0, **ego)
+        env = lj.Env(lj.Experiment(map="roundabout", horizon=3.0, slots=8, vehicles=6, ego=ego))
+        return np.asarray(jax.jit(env.reset)(jax.random.key(0))[0].there).sum()
+
+    assert there(view={"range": 1.0}) == 0 < there() < there(view={"range": 1e4})
+    assert there(view={"range": 1.0}, privileged=True) == there(view={"range": 1e4})
+    with pytest.raises(ValueError, match=r"view\.latency: 0\.3 s; expected a multiple of 0\.5 s"):
+        there(view={"latency": 0.3})
+
+
 def test_an_environment_needs_an_ego_and_a_known_action():
     with pytest.raises(lj.ExperimentError, match="ego: an environment needs at least one"):
         lj.Env(lj.Experiment(map="roundabout", ego=None, horizon=5, vehicles=2))

@@ -408,6 +408,21 @@ def at_entries():
     return states
 
 
+def test_errors_of_position_do_not_tell_the_route():
+    """A vehicle that is seen beyond the end of its lane is seen on the expected branch, not the true one."""
+    lane_map = bundled("roundabout")[1]
+    view = View(signal_distance=0.0, position_noise=4.0)
+
+    def lanes(state):
+        return view.look(CONFIG, lane_map, state, view.init(CONFIG, state), jax.random.key(3))[0].lane[1]
+
+    see = jax.jit(jax.vmap(lanes))
+    first, second = at_entries()
+    one, other = np.asarray(see(first)), np.asarray(see(second))
+    np.testing.assert_array_equal(one, other)
+    assert (one != np.asarray(first.lane)[:, 1]).sum() > 5
+
+
 @pytest.mark.engine
 def test_limsim_tm_decides_by_what_it_sees():
     lane_map = bundled("roundabout")[1]

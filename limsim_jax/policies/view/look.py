@@ -22,7 +22,7 @@ _MOTION = (
     "active", "lane", "previous", "s", "d", "v", "a", "side", "crossed", "progress", "shift", "waiting",
     "stopped", "yielding", "entered",
 )  # fmt: skip
-_HIDDEN = ("vehicle", "rest", "distance", "status", "struck", "struck_at")
+_HIDDEN = {"vehicle": -1, "rest": 0, "distance": 0, "status": 0, "struck": -1, "struck_at": 0}
 _PURPOSE = 0x5EE  # of the random keys
 
 
@@ -121,9 +121,11 @@ class View:
             past = tuple(jnp.concatenate([old[1:], new[None]]) for old, new in zip(past, now, strict=True))
         keys = jax.random.split(jax.random.fold_in(key, _PURPOSE), 3)
         seen = without(seen, ~(mine | self._visible(lane_map, seen, mine, keys[0])))
-        seen = self._blurred(lane_map, seen, mine, keys[1:])
+        signals = ~mine & self._signalling(seen)
+        goal = believed_goals(lane_map, seen, mine, signals, self.signal_distance)
+        seen = self._blurred(lane_map, replace(seen, goal=goal), mine, keys[1:])
         drivers = watch(config, lane_map, seen, sight.drivers)
-        return self._believed(lane_map, seen, mine, drivers), Sight(drivers, past)
+        return _believed(seen, mine, drivers), Sight(drivers, past)
 
     def _visible(
         self, lane_map: LaneMap, state: State, mine: Bool[Array, " N"], key: Key[Array, ""]
@@ -147,7 +149,7 @@ class View:
     def _blurred(
         self, lane_map: LaneMap, state: State, mine: Bool[Array, " N"], keys: Key[Array, " 2"]
     ) -> State:
-        """The vehicles with errors of measurement."""
+        """The vehicles with errors of measurement, on their believed routes."""
         sees = state.active & ~mine
         if self.position_noise > 0:
             error = jax.random.normal(keys[0], (2, *mine.shape), state.s.dtype) * self.position_noise
@@ -167,28 +169,12 @@ class View:
             state = replace(state, v=jnp.where(sees, jnp.maximum(state.v + error, 0), state.v))
         return state
 
-    def _believed(self, lane_map: LaneMap, state: State, mine: Bool[Array, " N"], drivers: Seen) -> State:
-        """The state with beliefs in the place of what cannot be seen."""
-        # a fixed share of the vehicles: a fraction that differs from vehicle to vehicle
-        number = jnp.arange(mine.shape[0], dtype=state.s.dtype)
+    def _signalling(self, state: State) -> Bool[Array, " N"]:
+        """Vehicles that signal their turns: always the same share of them."""
+        # a fraction that differs from vehicle to vehicle
+        number = jnp.arange(state.lane.shape[0], dtype=state.s.dtype)
         lot = number * 0.61803399 + state.entered * 0.7548777 + state.shape.length * 97.409
-        signals = ~mine & (lot - jnp.floor(lot) < self.signals)
-        driver = believed(drivers, state.shape.vehicle_class)
-        known = {
-            "driver": jax.tree.map(lambda own, guess: jnp.where(mine, own, guess), state.driver, driver),
-            "goal": believed_goals(lane_map, state, mine, signals, self.signal_distance),
-            "queues": jax.tree.map(jnp.zeros_like, state.queues),
-            "lights": replace(
-                state.lights,
-                elapsed=jnp.zeros_like(state.lights.elapsed),
-                gap=jnp.zeros_like(state.lights.gap),
-            ),
-        }
-        empty = {"vehicle": -1, "struck": -1}
-        for name in _HIDDEN:
-            true = getattr(state, name)
-            known[name] = jnp.where(mine, true, jnp.asarray(empty.get(name, 0), true.dtype))
-        return replace(state, **known)
+        return lot - jnp.floor(lot) < self.signals
 
 
 def view_of(table: Mapping[str, Any]) -> View:
@@ -207,6 +193,22 @@ def view_of(table: Mapping[str, Any]) -> View:
 
 
 _KINDS = {"bool": "true or false", "float": "a number"}
+
+
+def _believed(state: State, mine: Bool[Array, " N"], drivers: Seen) -> State:
+    """The state with beliefs about all that cannot be seen but routes."""
+
+    def own(true: Array, guess: Array | float) -> Array:
+        return jnp.where(mine, true, jnp.asarray(guess, true.dtype))
+
+    lights, none = state.lights, jnp.zeros_like(state.lights.elapsed)
+    return replace(
+        state,
+        driver=jax.tree.map(own, state.driver, believed(drivers, state.shape.vehicle_class)),
+        queues=jax.tree.map(jnp.zeros_like, state.queues),
+        lights=replace(lights, elapsed=none, gap=none),
+        **{name: own(getattr(state, name), guess) for name, guess in _HIDDEN.items()},
+    )
 
 
 def _before(state: State, mine: Bool[Array, " N"], past: dict[str, Array]) -> State:

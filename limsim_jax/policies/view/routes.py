@@ -90,11 +90,8 @@ def _meets(lane_map: LaneMap, state: State, branch: Int[Array, "N C"]) -> Bool[A
     lanes = [lane]
     for _ in range(_OWN_LANES):
         lanes.append(lane_map.routes.next_lane[lanes[-1], goal])
-    own = jnp.stack(lanes).reshape(-1)
     table = lane_map.conflicts
     foe = table.lane[table.foe[table.connector[branch]]]  # [N C K]
-    meets = jnp.zeros(branch.shape, bool)
-    for place in range(own.shape[0]):
-        here = own[place]
-        meets |= (here != NO_LANE) & ((branch == here) | (foe == here).any(-1))
-    return meets
+    near = jnp.concatenate([branch[..., None], foe], -1)
+    own = jnp.stack(lanes).reshape(1, 1, 1, -1)
+    return ((near[..., None] == own) & (own != NO_LANE)).any((-1, -2))
