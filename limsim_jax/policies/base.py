@@ -202,10 +202,19 @@ def sighted(policy: PolicyLike) -> PolicyLike:
 
 
 def views(policy: Any) -> list[View]:
-    """The views of a policy and of the policies in it."""
+    """The views of a policy and of the policies in it.
+
+    Raises:
+      ValueError: a view that is none.
+    """
     inner = [getattr(policy, name, None) for name in ("policy", "around", "ego")]
     found = [view for one in inner if isinstance(one, PolicyLike) for view in views(one)]
-    return found if getattr(policy, "privileged", False) else [*found, getattr(policy, "view", View())]
+    if getattr(policy, "privileged", False):
+        return found
+    view = getattr(policy, "view", View())
+    if not isinstance(view, View):
+        raise ValueError(f"view is {view!r}; expected a limsim_jax.View, or a table in a file")
+    return [*found, view]
 
 
 def knows(policy: Any) -> str:
@@ -302,7 +311,8 @@ def build_policy(factory: Callable[..., PolicyLike], options: Mapping[str, Any])
     for name in options:
         if name not in takes and not anything:
             raise ValueError(f"{name}: no such option; there are {', '.join(takes) or 'none'}")
-    if isinstance(options.get("view"), Mapping):  # as a file has it
+    ours = isinstance(factory, type) and issubclass(factory, Policy)
+    if ours and isinstance(options.get("view"), Mapping):  # as a file has it
         options = {**options, "view": view_of(options["view"])}
     return factory(**options)
 

@@ -204,11 +204,11 @@ class Episodes:
             self._refuse("traffic.density", f"{starts} at least {needed} at the start")
 
     def _check_views(self, config: Config) -> None:
-        for view in views(self._policy):
-            try:
+        try:
+            for view in views(self._policy):
                 view.late(config)
-            except ValueError as error:
-                self._refuse("ego.view", str(error))
+        except ValueError as error:
+            self._refuse("ego.view", str(error))
 
     def _check_policy(self) -> dict[str, Any] | None:
         """The code of a policy of one's own.

@@ -106,7 +106,7 @@ class EgoTable(_Table):
     """One of `limsim_jax.policies`, or "package.module:factory" of your own."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Arguments of the policy."""
-    view: dict[str, bool | int | float] = Field(default_factory=dict)
+    view: dict[str, Any] = Field(default_factory=dict)
     """What the policy sees: fields of `policies.view.View`."""
     privileged: bool | None = None
     """Whether the policy gets the true state instead of a view; absent: as the policy says."""

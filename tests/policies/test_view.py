@@ -448,6 +448,7 @@ def test_limsim_tm_decides_by_what_it_sees():
         ("view = { misses = 1.5 }", "view.misses: 1.5; expected a share within 0 and 1"),
         ("view = { latency = -1 }", "view.latency: -1 s; expected 0 or more"),
         ("view = { misses = true }", "view.misses: True; expected a number"),
+        ('view = { range = "80 m" }', "ego.view: view.range: '80 m'; expected a number"),
         ("view = { occlusion = 1.0 }", "view.occlusion: 1.0; expected true or false"),
         ("privileged = 3", "ego.privileged"),
     ],
@@ -482,6 +483,11 @@ def test_a_latency_between_decisions_and_a_speed_in_km_h_are_told(tmp_path):
         file.write_text(text.replace("POLICY", policy))
         with pytest.raises(ExperimentError, match=r"ego\.view: view\.latency: 0\.7 s; expected a mult"):
             Episodes(read_experiments(file)[0])
+    file.write_text(
+        text.replace("POLICY", "limsim_tm").replace("view = { latency = 0.7 }", "options = { view = 80 }")
+    )
+    with pytest.raises(ExperimentError, match=r"policy: view is 80; expected a limsim_jax\.View"):
+        Episodes(read_experiments(file)[0])
     town = map_of(read_experiments("ramp")[0])
     file.write_text('map = "ramp"\nhorizon = 20\n[ego]\nv = 120\n[[traffic.flow]]\nrate = 400\nspeed = 30\n')
     told = doubts(read_experiments(file)[0], town)

@@ -187,12 +187,16 @@ def view_of(table: Mapping[str, Any]) -> View:
     for name, value in table.items():
         if name not in known:
             raise ValueError(f"{name}: no such field; known are {', '.join(known)}")
-        if isinstance(value, bool) != (known[name] == "bool"):
-            raise ValueError(f"view.{name}: {value}; expected {_KINDS[str(known[name])]}")
+        kinds, words = _KINDS[str(known[name])]
+        if not isinstance(value, kinds) or isinstance(value, bool) != (kinds is bool):
+            raise ValueError(f"view.{name}: {value!r}; expected {words}")
     return View(**table)
 
 
-_KINDS = {"bool": "true or false", "float": "a number"}
+_KINDS: dict[str, tuple[Any, str]] = {
+    "bool": (bool, "true or false"),
+    "float": ((int, float), "a number"),
+}
 
 
 def _believed(state: State, mine: Bool[Array, " N"], drivers: Seen) -> State:
