@@ -486,7 +486,7 @@ def test_a_latency_between_decisions_and_a_speed_in_km_h_are_told(tmp_path):
     file.write_text(
         text.replace("POLICY", "limsim_tm").replace("view = { latency = 0.7 }", "options = { view = 80 }")
     )
-    with pytest.raises(ExperimentError, match=r"policy: view is 80; expected a limsim_jax\.View"):
+    with pytest.raises(ExperimentError, match=r"ego\.view: view is 80; expected a limsim_jax\.View"):
         Episodes(read_experiments(file)[0])
     town = map_of(read_experiments("ramp")[0])
     file.write_text('map = "ramp"\nhorizon = 20\n[ego]\nv = 120\n[[traffic.flow]]\nrate = 400\nspeed = 30\n')
