@@ -1,7 +1,11 @@
 from .api.env import Env as Env
+from .api.experiment import Action as Action
 from .api.experiment import Ego as Ego
 from .api.experiment import Experiment as Experiment
 from .api.experiment import Flow as Flow
+from .api.experiment import Obstacle as Obstacle
+from .api.experiment import Vehicle as Vehicle
+from .api.experiment import Zone as Zone
 from .api.experiment import load_experiments as load_experiments
 from .api.map import Map as Map
 from .api.map import load_map as load_map

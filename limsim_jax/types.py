@@ -1,8 +1,8 @@
 """The types of a simulation.
 
 `Config` is fixed for a run, `Scenario` for an episode; a step changes the `State`. Shapes stand at the
-fields: `N` vehicle slots, `V` vehicles of a schedule, `O` origins, `E` egos. All types describe one world;
-a batch is a `vmap`. SI units, radians, counter-clockwise; `d > 0` is left.
+fields: `N` vehicle slots, `V` vehicles of a schedule, `O` origins, `E` egos, `A` actions, `Z` zones. All
+types describe one world; a batch is a `vmap`. SI units, radians, counter-clockwise; `d > 0` is left.
 """
 
 from __future__ import annotations
@@ -76,6 +76,64 @@ class Status(enum.IntFlag):
     MISSED_ROUTE = 16  # could not reach the lane that its goal needs
     NOT_FINITE = 32
     HARD_BRAKE = 64  # braked harder than its driver's `b_max`
+    SCRIPTED = 128  # a vehicle of the experiment's `[[vehicle]]` list
+
+
+class Order(enum.IntEnum):
+    """What an action of a script asks of its vehicle."""
+
+    BRAKE = 0
+    SPEED = 1
+    CHANGE_LANE = 2
+    LEAVE = 3
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Actions:
+    """Orders to vehicles, `A` of them; those of a vehicle stand in the order in which they begin.
+
+    An action begins when all its conditions hold and the one before it has begun.
+    """
+
+    slot: Int[Array, " A"]  # of its vehicle
+    order: Int[Array, " A"]  # an `Order`
+    value: Float[Array, " A"]  # BRAKE: m/s^2; SPEED: m/s; CHANGE_LANE: +1 left, -1 right
+    rate: Float[Array, " A"]  # m/s^2, SPEED: how fast it gets there; 0: as its driver would
+    duration: Float[Array, " A"]  # s; inf: until the next one; CHANGE_LANE: of the move, inf: its driver's
+    careful: Bool[Array, " A"]  # minds others, bends and signals all the same
+    # conditions
+    at: Float[Array, " A"]  # s since the start, at least
+    within: Float[Array, " A"]  # m to the nearest ego, middle to middle, at most
+    travelled: Float[Array, " A"]  # m since the start, at least
+    after: Float[Array, " A"]  # s since the one before has begun, at least
+    before: Int[Array, " A"]  # the action before it, -1: none
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Zones:
+    """Speed limits and friction that differ from the map's, `Z` zones."""
+
+    lanes: Bool[Array, "Z L"]
+    begin: Float[Array, " Z"]  # s
+    end: Float[Array, " Z"]  # s
+    limit: Float[Array, " Z"]  # m/s; inf: the map's
+    friction: Float[Array, " Z"]  # coefficient between tyres and road; inf: of a dry road
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Script:
+    """What an experiment says about single vehicles and places."""
+
+    actions: Actions | None
+    zones: Zones | None
+
+
+@struct.dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a script is."""
+
+    begun: Float[Array, " A"]  # s, when each action began; inf: not yet
+    made: Bool[Array, " A"]  # lane changes that have started
 
 
 @struct.dataclass(frozen=True, kw_only=True)
@@ -94,6 +152,7 @@ class Schedule:
     driver: Driver  # [V]
     shape: Shape  # [V]
     start: Int[Array, " O1"]  # rows start[o] .. start[o + 1] - 1 belong to origin o
+    script: Script | None = None  # orders of the experiment
 
 
 @struct.dataclass(frozen=True, kw_only=True)
@@ -166,6 +225,7 @@ class State:
     queues: Queues
     lights: Lights
     egos: Egos
+    script: Progress | None = None  # None: there is none
 
 
 @struct.dataclass(frozen=True, kw_only=True)

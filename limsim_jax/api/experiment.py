@@ -14,10 +14,14 @@ from limsim_jax.maps import bundled_maps
 from limsim_jax.maps.network import MapError, Network
 from limsim_jax.sweeps import experiment as _file
 from limsim_jax.sweeps.experiment import (
+    ActionTable,
     EgoTable,
     ExperimentError,
     ExperimentFile,
     FlowTable,
+    ObstacleTable,
+    VehicleTable,
+    ZoneTable,
     first_fault,
     read_experiments,
 )
@@ -33,24 +37,38 @@ if TYPE_CHECKING:
 _ABSENT: Any = type("Absent", (), {"__repr__": lambda _: "..."})()
 
 
-class Flow(FlowTable):
+class _Named:
+    """A table that names itself where a field is wrong."""
+
+    def __init__(self, **fields: Any) -> None:
+        try:
+            super().__init__(**fields)
+        except ValidationError as error:
+            raise ExperimentError(f"{type(self).__name__}: {first_fault(error)}") from None
+
+
+class Flow(_Named, FlowTable):
     """Vehicles that come in: `lj.Flow(rate=400, origin="1-", goal="3+")`; rate in veh/h of each origin."""
 
-    def __init__(self, **fields: Any) -> None:
-        try:
-            super().__init__(**fields)
-        except ValidationError as error:
-            raise ExperimentError(f"Flow: {first_fault(error)}") from None
 
-
-class Ego(EgoTable):
+class Ego(_Named, EgoTable):
     """A vehicle under test: `lj.Ego(start="1-", goal="3+")`; without a start it is drawn in every world."""
 
-    def __init__(self, **fields: Any) -> None:
-        try:
-            super().__init__(**fields)
-        except ValidationError as error:
-            raise ExperimentError(f"Ego: {first_fault(error)}") from None
+
+class Vehicle(_Named, VehicleTable):
+    """A vehicle with a place, and actions, of its own: `lj.Vehicle(start="1-", s=80.0, action=[...])`."""
+
+
+class Action(_Named, ActionTable):
+    """An order to a vehicle: `lj.Action(at=5.0, brake=4.0)`, `lj.Action(within=30.0, leave=True)`."""
+
+
+class Obstacle(_Named, ObstacleTable):
+    """A body that stands on a lane: `lj.Obstacle(start="1-", lane=1, s=300.0)`."""
+
+
+class Zone(_Named, ZoneTable):
+    """A place with closed lanes, another limit or friction: `lj.Zone(where="3", speed_limit=8.3)`."""
 
 
 class Experiment:
@@ -72,6 +90,9 @@ class Experiment:
       policy: drives the egos: a value such as `PDMClosed()`, or a name.
       flows: `Flow`s that come in.
       vehicles: on the road at the start.
+      placed: `Vehicle`s with a place, and actions, of their own.
+      obstacles: `Obstacle`s on the road.
+      zones: `Zone`s with closed lanes, other limits or friction.
       density: instead of that, vehicles per km of lane at the start.
       mix: shares of vehicle classes.
       drivers: a `Population`, or the file of one.
@@ -101,6 +122,9 @@ class Experiment:
         policy: PolicyLike | str | None = None,
         flows: Sequence[FlowTable] | None = None,
         vehicles: int | None = None,
+        placed: Sequence[VehicleTable] | None = None,
+        obstacles: Sequence[ObstacleTable] | None = None,
+        zones: Sequence[ZoneTable] | None = None,
         density: float | None = None,
         mix: Mapping[str, float] | None = None,
         drivers: Population | str | Path | None = None,
@@ -118,6 +142,9 @@ class Experiment:
         fields = {
             "name": name, "horizon": _number(horizon), "slots": slots, "dt": _number(dt),
             "decision_every": decision_every, "description": description,
+            "vehicle": None if placed is None else list(placed),
+            "obstacle": None if obstacles is None else list(obstacles),
+            "zone": None if zones is None else list(zones),
         }  # fmt: skip
         traffic = {
             "flow": None if flows is None else list(flows), "vehicles": vehicles, "density": _number(density),
@@ -278,4 +305,4 @@ def _number(x: float | None) -> float | None:
     return float(x) if isinstance(x, int) and not isinstance(x, bool) else x
 
 
-__all__ = ["Ego", "Experiment", "Flow", "load_experiments"]
+__all__ = ["Action", "Ego", "Experiment", "Flow", "Obstacle", "Vehicle", "Zone", "load_experiments"]

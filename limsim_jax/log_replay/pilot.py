@@ -178,7 +178,7 @@ def _alone(state: State, slot: Array) -> State:
     def row(x: Array) -> Array:
         return x[slot][None] if x.ndim == 1 and x.shape[0] == number else x
 
-    names = [name for name in vars(state) if name not in ("step", "queues", "lights", "egos")]
+    names = [name for name in vars(state) if name not in ("step", "queues", "lights", "egos", "script")]
     rows = {name: jax.tree.map(row, getattr(state, name)) for name in names}
     return replace(state, egos=replace(state.egos, slot=jnp.zeros(1, jnp.int32)), **rows)
 

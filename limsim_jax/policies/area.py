@@ -19,9 +19,10 @@ from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.base import Policy, PolicyLike, knows, renew_rows, seeing, sighted, variants
 from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.predict import Predictor
+from limsim_jax.policies.several import joined
 from limsim_jax.policies.view import View
 from limsim_jax.traffic.command import Command
-from limsim_jax.traffic.ego import Egos, Trajectory, assign
+from limsim_jax.traffic.ego import assign
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, State, Status
 
@@ -160,7 +161,10 @@ class AreaOfInterest(Policy):
         commands, inner = zip(*found, strict=True)
         if len(commands) == 1:
             return commands[0], inner
-        return _joined(commands[0], commands[1], state.egos), inner
+        if commands[-1].trajectory is None:
+            raise ValueError("around: this planner returns no trajectories")
+        count = state.egos.slot.shape[0] - self.slots
+        return joined([(commands[0], count), (commands[1], self.slots)]), inner
 
     def _choose(self, lane_map: LaneMap, state: State, memory: Places, now: Float[Array, ""]) -> Places:
         """The places from now on; a vehicle that keeps its place keeps its row."""
@@ -180,7 +184,8 @@ class AreaOfInterest(Policy):
         midway = stays & ((state.side != 0) | (jnp.abs(state.d) > _ASIDE))
         last = lane_map.routes.is_goal[state.lane, state.goal]
         leaving = last & (lane_map.length[state.lane] - state.s < 3.0 * state.v + 10.0)
-        fit = state.active & ~is_ego & (~leaving | midway) & ((state.status & int(Status.COLLIDED)) == 0)
+        fit = state.active & ~is_ego & (~leaving | midway)
+        fit &= (state.status & int(Status.COLLIDED | Status.SCRIPTED)) == 0
         fit &= ~(has & ~same[None]).any(-1)  # a slot whose vehicle has changed is free for one decision
         fit &= stays | ((state.side == 0) & (state.s > state.shape.length))
         leave = 1.3 * self.radius if self.leave is None else self.leave
@@ -214,38 +219,3 @@ def _with_others(policy: PolicyLike, count: int) -> PolicyLike:
     if is_dataclass(policy) and any(f.name == "others" for f in fields(policy)):
         return replace(policy, others=count)
     return policy
-
-
-def _joined(first: Command, second: Command, egos: Egos) -> Command:
-    """One command for the rows of both.
-
-    Trajectories are at the moments of the second.
-
-    Raises:
-      ValueError: a policy with free egos that returns no trajectory.
-    """
-    much = second.trajectory
-    if much is None:
-        raise ValueError("around: this planner returns no trajectories")
-    mine = first.trajectory
-    rows = egos.slot.shape[0] - much.x.shape[0]
-    if mine is None:
-        if first.control is not None:
-            raise ValueError(
-                "ego: a planner that returns controls cannot be joined with one that returns trajectories"
-            )
-        values = [jnp.zeros((rows, much.x.shape[1]), much.x.dtype)] * 4
-        meta = None if first.meta is None else jnp.concatenate([first.meta, jnp.full(much.x.shape[0], -1)])
-    else:
-        found = mine.at(much.t0 + much.dt * jnp.arange(much.x.shape[1], dtype=much.x.dtype))
-        values = [found[..., k] for k in range(4)]
-        meta = None
-    x, y, heading, v = (
-        jnp.concatenate([a, b]) for a, b in zip(values, (much.x, much.y, much.heading, much.v), strict=True)
-    )
-    signal = None
-    if second.signal is not None:
-        mine = jnp.zeros(rows, second.signal.dtype) if first.signal is None else first.signal
-        signal = jnp.concatenate([mine, second.signal])
-    trajectory = Trajectory(x=x, y=y, heading=heading, v=v, t0=much.t0, dt=much.dt)
-    return Command(trajectory=trajectory, meta=meta, signal=signal)

@@ -208,6 +208,7 @@ def views(policy: Any) -> list[View]:
       ValueError: a view that is none.
     """
     inner = [getattr(policy, name, None) for name in ("policy", "around", "ego")]
+    inner += getattr(policy, "policies", ())
     found = [view for one in inner if isinstance(one, PolicyLike) for view in views(one)]
     if getattr(policy, "privileged", False):
         return found

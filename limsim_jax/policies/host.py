@@ -399,8 +399,9 @@ def failure_reasons(policy: Any) -> dict[bytes, str]:
     if isinstance(policy, HostPolicy):
         found |= policy.failures
     for value in vars(policy).values() if is_dataclass(policy) else ():
-        if is_dataclass(value) and not isinstance(value, type):
-            found |= failure_reasons(value)
+        for one in value if isinstance(value, tuple) else (value,):
+            if is_dataclass(one) and not isinstance(one, type):
+                found |= failure_reasons(one)
     return found
 
 

@@ -26,6 +26,7 @@ from limsim_jax.report.tables import (
     groups,
     metrics_of,
     null,
+    provenance_of,
     with_shares,
 )
 from limsim_jax.statistics import (
@@ -113,7 +114,7 @@ def compare(
     notes: list[str] = []
     for first, second in pairs:
         _check_same_world(a, b, first, second)
-        notes += _version_notes(a.provenance.get(first, {}), b.provenance.get(second, {}), first[0])
+        notes += _version_notes(provenance_of(a, first), provenance_of(b, second), first[0])
         found, said = _compared(a, b, parts_a[first], parts_b[second], first, second, level)
         rows += found
         notes += said
@@ -196,7 +197,7 @@ def _pairs(
 
 def _check_same_world(a: Results, b: Results, first: Group, second: Group) -> None:
     """The same seed must be the same world, judged alike."""
-    here, there = a.provenance.get(first, {}), b.provenance.get(second, {})
+    here, there = provenance_of(a, first), provenance_of(b, second)
     for part in ("map", "experiment"):
         own, other = _flat(here.get(part)), _flat(there.get(part))
         if part == "map" and "hash" in own and "hash" in other:

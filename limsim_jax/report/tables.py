@@ -90,8 +90,31 @@ def groups(results: Results) -> dict[Group, pa.Table]:
     parts = {}
     for scenario, policy in order:
         rows = (pc.field("scenario") == scenario) & (pc.field("policy") == policy)
-        parts[scenario, policy] = table.filter(rows).sort_by([("seed", "ascending"), ("ego", "ascending")])
+        part = table.filter(rows).sort_by([("seed", "ascending"), ("ego", "ascending")])
+        names = results.provenance.get((scenario, policy), {}).get("policies")
+        if names is None:
+            parts[scenario, policy] = part
+        for k, name in enumerate(names or ()):  # each ego has a policy of its own
+            parts[scenario, ego_label(name, k)] = part.filter(pc.field("ego") == k)
     return parts
+
+
+def ego_label(policy: str, number: int) -> str:
+    """Name of the policy of one of several egos in tables."""
+    return f"{policy} (ego {number})"
+
+
+def provenance_of(results: Results, group: Group) -> dict[str, Any]:
+    """How the rows of a group were made; empty if that is not known."""
+    if group in results.provenance:
+        return results.provenance[group]
+    for (scenario, _), about in results.provenance.items():
+        for k, (name, known) in enumerate(
+            zip(about.get("policies", ()), about.get("each_knows", ()), strict=True)
+        ):
+            if (scenario, ego_label(name, k)) == group:
+                return about | {"knows": known}
+    return {}
 
 
 def columns(episodes: pa.Table, names: Sequence[str]) -> Floats:
@@ -328,7 +351,7 @@ def knows(results: Results, group: Group) -> str:
     Empty without an ego, and in results that do not say it.
     """
     words = {"state": "all", "view": "what it sees"}
-    return words.get(results.provenance.get(group, {}).get("knows", ""), "")
+    return words.get(provenance_of(results, group).get("knows", ""), "")
 
 
 def _causes_note(group: Group, part: pa.Table, several: bool) -> str:

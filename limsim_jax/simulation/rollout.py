@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -26,6 +27,7 @@ from limsim_jax.traffic.collision import collided
 from limsim_jax.traffic.demand import delayed
 from limsim_jax.traffic.ego import with_rows
 from limsim_jax.traffic.engine import Tick, Traffic, drive
+from limsim_jax.traffic.script import lanes_now
 from limsim_jax.types import Config, Scenario, Schedule, State
 from limsim_jax.xla import mapped_like
 
@@ -141,19 +143,20 @@ class Rollout:
         config, measure, policy = self.config, self.measure, sighted(self.policy)
         trace = None if self.record is None else self.record(lane_map)
 
-        def record(tick: Tick) -> tuple[Any, Any]:
+        def record(lanes: LaneMap, tick: Tick) -> tuple[Any, Any]:
             kept = None if trace is None else trace(tick)
-            return kept, None if measure is None else measure.record(config, lane_map, tick)
+            return kept, None if measure is None else measure.record(config, lanes, tick)
 
         def decide(carry: Carry, _: None) -> tuple[Carry, Any]:
             state, memory, totals, stood, measured = carry
             now = jax.random.fold_in(key, state.step)
-            command, memory = policy(config, lane_map, state, memory, now)
+            lanes = lanes_now(config, lane_map, schedule, state)
+            command, memory = policy(config, lanes, state, memory, now)
             after, (kept, records) = drive(
-                config, self.traffic, lane_map, state, schedule, command, record, free=self._free
+                config, self.traffic, lanes, state, schedule, command, partial(record, lanes), free=self._free
             )
             if measure is not None:
-                measured = measure.update(config, lane_map, measured, records)
+                measured = measure.update(config, lanes, measured, records)
             totals, stood = count(config, totals, stood, state, after)
             new = Carry(after, memory, totals, stood, measured)
             if self.traffic.after_collision == "end":

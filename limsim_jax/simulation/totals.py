@@ -70,7 +70,8 @@ def count(config: Config, totals: Totals, stood: Stood, before: State, after: St
     new = jnp.where(was, after.status & ~jnp.where(same, before.status, 0), 0)
     driven = after.distance - jnp.where(fresh, 0, before.distance)
 
-    got_on = ~(same & after.active) | (after.distance - stood.at >= GOT_ON)
+    scripted = (after.status & int(Status.SCRIPTED)) != 0  # may stand for good, as an obstacle
+    got_on = ~(same & after.active) | (after.distance - stood.at >= GOT_ON) | scripted
     stood = Stood(jnp.where(got_on, after.distance, stood.at), jnp.where(got_on, now, stood.since))
 
     def events(bit: Status) -> Int[Array, ""]:

@@ -11,19 +11,20 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from limsim_jax.maps import bundled_maps
-from limsim_jax.maps.lane_map import LaneMap, lane_rows
+from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.map import Map, load_map
 from limsim_jax.maps.network import MapError, Network
 from limsim_jax.maps.origins import origins, road_origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.policies import POLICIES
 from limsim_jax.policies.base import PolicyLike, build_policy, seeing
+from limsim_jax.policies.several import Several
 from limsim_jax.policies.view import view_of
 from limsim_jax.sweeps.experiment import EgoTable, ExperimentError, ExperimentFile
+from limsim_jax.sweeps.places import placed, vehicles_of
 from limsim_jax.traffic import car_following
 from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand
 from limsim_jax.traffic.engine import Traffic
@@ -33,10 +34,7 @@ from limsim_jax.traffic.vehicles import (
     Population,
     default_population,
     restrict_to_map,
-    sample_vehicles,
-    uniform_population,
 )
-from limsim_jax.xla import run_once
 
 MODELS: dict[str, Callable[[], Any]] = {
     "idm": car_following.IDM,
@@ -52,11 +50,21 @@ ROADS_OF_A_CLOSED_MAP = 12
 
 
 def policy_of(experiment: ExperimentFile) -> PolicyLike:
-    """The policy that the file names, with its options."""
-    if not experiment.ego:
+    """The policy that the file names, with its options; of egos that differ in it, `Several`."""
+    egos, name = experiment.ego, experiment.name
+    if not egos:
         return POLICIES["like_traffic"]()
-    name, options = experiment.ego[0].policy, experiment.ego[0].options
-    where = f"{experiment.name}: ego.policy"
+    if experiment.one_policy:
+        return _policy(name, "ego", egos[0])
+    policies = tuple(_policy(name, f"ego.{k}", ego) for k, ego in enumerate(egos))
+    try:
+        return Several(policies)
+    except ValueError as error:
+        raise ExperimentError(f"{name}: ego.policy: {error}") from None
+
+
+def _policy(experiment: str, field: str, ego: EgoTable) -> PolicyLike:
+    name, where = ego.policy, f"{experiment}: {field}.policy"
     if ":" in name:
         factory = _own(name, where)
     elif name in POLICIES:
@@ -66,20 +74,19 @@ def policy_of(experiment: ExperimentFile) -> PolicyLike:
             f"{where}: unknown policy '{name}'; known are {', '.join(POLICIES)}, or module:factory"
         )
     try:
-        policy = build_policy(factory, options)
+        policy = build_policy(factory, ego.options)
     except (TypeError, ValueError) as error:
-        raise ExperimentError(f"{experiment.name}: ego.options: {error}") from None
+        raise ExperimentError(f"{experiment}: {field}.options: {error}") from None
     if not isinstance(getattr(policy, "free", None), bool):
         raise ExperimentError(f"{where}: '{name}' is no policy; see limsim_jax.policies.base.Policy")
-    return with_view(experiment, policy)
+    return with_view(ego, policy)
 
 
-def with_view(experiment: ExperimentFile, policy: PolicyLike) -> PolicyLike:
-    """The policy with the view that the file gives to its egos."""
-    for ego in experiment.ego[:1]:  # one policy drives all
-        if ego.view or ego.privileged is not None:
-            view = view_of(ego.view) if ego.view else None
-            return seeing(policy, view=view, privileged=ego.privileged)
+def with_view(ego: EgoTable, policy: PolicyLike) -> PolicyLike:
+    """The policy with the view that the file gives to its ego."""
+    if ego.view or ego.privileged is not None:
+        view = view_of(ego.view) if ego.view else None
+        return seeing(policy, view=view, privileged=ego.privileged)
     return policy
 
 
@@ -110,105 +117,29 @@ def map_of(experiment: ExperimentFile, town: Map | None = None) -> Map:
             known = ", ".join(bundled_maps())
             hint = "" if os.path.exists(experiment.map) else f"; bundled maps are {known}"
             raise ExperimentError(f"{experiment.name}: map: {error}{hint}") from None
-    wanted = [ego.goal for ego in experiment.ego if ego.goal]
+    wanted = [x.goal for x in (*experiment.ego, *experiment.vehicle) if x.goal]
     for flow in experiment.traffic.flow:
         wanted += [flow.goal] if isinstance(flow.goal, str) else list(flow.goal or ())
     return town.with_goals(wanted)
 
 
-def egos_of(experiment: ExperimentFile, town: Map, free: bool) -> EgoStart | None:
+def egos_of(experiment: ExperimentFile, town: Map, policy: PolicyLike) -> EgoStart | None:
     """Where the egos start and what they are; None without one."""
     tables, name = experiment.ego, experiment.name
     if not tables:
         return None
-    vehicles = [_vehicle(ego, name) for ego in tables]
-    driver, shape = jax.tree.map(lambda *x: jnp.concatenate(x), *vehicles)
+    driver, shape = vehicles_of(f"{name}: ego", tables)
     speeds = [ego.v for ego in tables]
     if any(v is None for v in speeds) and any(v is not None for v in speeds):
         raise ExperimentError(f"{name}: ego.v: {len(tables)} egos need a speed each, or none has one")
     v = None if speeds[0] is None else jnp.asarray(speeds, jnp.float32)
-    common = {"driver": driver, "shape": shape, "v": v, "free": jnp.asarray([free] * len(tables))}
+    free = policy.frees if isinstance(policy, Several) else [policy.free] * len(tables)
+    common = {"driver": driver, "shape": shape, "v": v, "free": jnp.asarray(free)}
     if all(ego.start == "random" for ego in tables):
         return EgoStart(**common)
     if any(ego.start == "random" for ego in tables):
         raise ExperimentError(f"{name}: ego.start: {len(tables)} egos need a start each, or all are random")
-    rows, places, columns = [], [], []
-    for ego, length in zip(tables, shape.length.tolist(), strict=True):
-        row, column = _place(name, ego, town)
-        rows.append(row)
-        columns.append(column)
-        places.append(max(ego.s, length))
-    return EgoStart(
-        lane=jnp.asarray(rows, jnp.int32),
-        s=jnp.asarray(places, jnp.float32),
-        goal=jnp.asarray(columns, jnp.int32),
-        **common,
-    )
-
-
-def _vehicle(ego: EgoTable, name: str) -> Any:
-    """Driver and shape of an ego."""
-    try:
-        population = uniform_population(ego.vehicle, **ego.driver)
-    except ValueError as error:
-        raise ExperimentError(f"{name}: ego: {error}") from None
-    vehicle = jnp.argmax(population.share)[None].astype(jnp.int32)
-    # compiled as one program: operation by operation it takes seconds
-    sample = jax.jit(sample_vehicles, compiler_options=run_once())
-    return sample(population, jax.random.key(0), jnp.zeros(1, jnp.int32), vehicle)
-
-
-def _place(name: str, ego: EgoTable, town: Map) -> tuple[int, int]:
-    """Row of the start lane and column of the goal."""
-    network, lane_map, goals = town.network, town.lanes, town.goals
-    lane = _start_lane(name, ego, network)
-    length = network.lanes[lane].length
-    if not ego.s < length:
-        raise ExperimentError(f"{name}: ego.s: {ego.s:g} m, but lane '{lane}' is only {length:.1f} m long")
-    if ego.goal is None or ego.goal not in goals:
-        raise ExperimentError(f"{name}: ego.goal: no goal or lane '{ego.goal}'; goals are {', '.join(goals)}")
-    row, column = lane_rows(network)[lane], list(goals).index(ego.goal)
-    if not bool(lane_map.routes.reachable[row, column]):
-        can = [goal for k, goal in enumerate(goals) if bool(lane_map.routes.reachable[row, k])]
-        raise ExperimentError(
-            f"{name}: ego.goal: '{ego.goal}' cannot be reached from lane '{lane}'; "
-            f"from there it goes to {', '.join(can) or 'nowhere'}"
-        )
-    return row, column
-
-
-def _start_lane(name: str, ego: EgoTable, network: Network) -> str:
-    """The lane that the ego starts on."""
-    known = origins(network)
-    if ego.start in network.lanes:
-        lanes = [ego.start]
-    elif ego.start in known:
-        lanes = list(known[ego.start])
-    else:
-        road = [lane for lane in network.drivable_lanes() if lane.road == ego.start and lane.junction is None]
-        first = [lane for lane in road if lane.section == min(x.section for x in road)]
-        if len({lane.number < 0 for lane in first}) > 1:
-            raise ExperimentError(
-                f"{name}: ego.start: road '{ego.start}' has traffic both ways; name one of its lanes, as "
-                f"'{first[0].id}'"
-            )
-        lanes = [lane.id for lane in first]
-    if not lanes:
-        raise ExperimentError(
-            f"{name}: ego.start: no origin, road or lane '{ego.start}'; origins are {', '.join(known)}"
-        )
-    rightmost = [lane for lane in lanes if network.lanes[lane].right not in lanes]
-    ordered = rightmost[:1]
-    while ordered and network.lanes[ordered[-1]].left in lanes:
-        ordered.append(str(network.lanes[ordered[-1]].left))
-    if ego.lane >= len(ordered):
-        raise ExperimentError(
-            f"{name}: ego.lane: {ego.lane}, but '{ego.start}' has lanes 0 to {len(ordered) - 1}"
-        )
-    chosen = network.lanes[ordered[ego.lane]]
-    if not chosen.drivable or chosen.junction is not None:
-        raise ExperimentError(f"{name}: ego.start: lane '{chosen.id}' is no lane to start on")
-    return chosen.id
+    return EgoStart(**placed(f"{name}: ego", tables, shape, town), **common)
 
 
 def doubts(experiment: ExperimentFile, town: Map) -> list[str]:
@@ -216,6 +147,13 @@ def doubts(experiment: ExperimentFile, town: Map) -> list[str]:
     limit = max(lane.speed_limit for lane in town.network.drivable_lanes())
     flows = enumerate(experiment.traffic.flow)
     speeds = [("ego.v", ego.v) for ego in experiment.ego]
+    speeds += [(f"vehicle.{k}.v", x.v) for k, x in enumerate(experiment.vehicle)]
+    speeds += [
+        (f"vehicle.{k}.action.{i}.speed", action.speed)
+        for k, x in enumerate(experiment.vehicle)
+        for i, action in enumerate(x.action)
+    ]
+    speeds += [(f"zone.{k}.speed_limit", x.speed_limit) for k, x in enumerate(experiment.zone)]
     speeds += [(f"traffic.flow.{k}.speed", flow.speed) for k, flow in flows]
     return [
         f"{experiment.name}: {field}: {v:g} m/s, but the highest limit of the map is {limit:.1f} m/s; "
@@ -248,7 +186,11 @@ def flows_of(experiment: ExperimentFile, town: Map) -> list[Flow]:
 
 
 def demand_of(
-    experiment: ExperimentFile, town: Map, egos: EgoStart | None, drivers: Population | None = None
+    experiment: ExperimentFile,
+    town: Map,
+    egos: EgoStart | None,
+    drivers: Population | None = None,
+    placed: EgoStart | None = None,
 ) -> Demand:
     """The vehicles of the start and those that come later."""
     traffic = experiment.traffic
@@ -256,7 +198,8 @@ def demand_of(
         population = restrict_to_map(population_of(experiment, drivers), town.lanes)
         return build_demand(
             town.network, town.lanes, town.goals, flows_of(experiment, town), population,
-            horizon=experiment.horizon, density=traffic.density, vehicles=traffic.vehicles, egos=egos,
+            horizon=experiment.horizon, density=traffic.density, vehicles=traffic.vehicles,
+            egos=egos, placed=placed,
         )  # fmt: skip
     except ValueError as error:
         raise ExperimentError(f"{experiment.name}: traffic: {error}") from None

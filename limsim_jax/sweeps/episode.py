@@ -32,9 +32,9 @@ from limsim_jax.metrics.reductions import on_host
 from limsim_jax.policies.area import PARTS
 from limsim_jax.policies.base import PolicyLike, check_policy, knows, policy_name, views
 from limsim_jax.policies.host import failure_reasons
+from limsim_jax.policies.several import Several
 from limsim_jax.simulation.ending import Watch
-from limsim_jax.simulation.rollout import Rollout, decision_key
-from limsim_jax.simulation.totals import Totals
+from limsim_jax.simulation.rollout import Result, Rollout, decision_key
 from limsim_jax.simulation.trace import trace
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweeps.build import (
@@ -51,6 +51,7 @@ from limsim_jax.sweeps.experiment import NO_POLICY, Bounds, ExperimentError, Exp
 from limsim_jax.sweeps.identity import describe, describe_program, is_foreign, policy_code, without_sources
 from limsim_jax.sweeps.moments import key_moments
 from limsim_jax.sweeps.reruns import CanBrake, Replay, Reruns
+from limsim_jax.sweeps.script import script_of, script_vehicles, with_zones
 from limsim_jax.sweeps.store import Outcome
 from limsim_jax.traffic.car_following import CarFollowing
 from limsim_jax.traffic.demand import Flow, sample_scenario
@@ -65,6 +66,8 @@ _CHUNKS = {"cpu": 50, "gpu": 2000, "tpu": 2000}
 
 AFTERWARDS = 12.0
 """s that a brief replay goes on without its ego: `UNSAFE` s, and the look-ahead of a planner at their end."""
+
+_BEGUN = "actions_begun"
 
 _NO_PART_OF_ROWS = ("api", "bench", "bench.py", "cli", "report")
 """Rooms whose code changes no row."""
@@ -103,13 +106,19 @@ class Episodes:
         self.scenario = experiment.name
         self.policy = NO_POLICY if not experiment.ego else experiment.policy if name is None else name
         self._values = {"policy": policy, "drivers": drivers, "model": model, "metrics": tuple(metrics)}
-        self._policy = policy_of(experiment) if policy is None else with_view(experiment, policy)
-        self.town = map_of(experiment, town)
-        self._egos = egos_of(experiment, self.town, self._policy.free)
+        if policy is None or not experiment.ego:
+            self._policy = policy_of(experiment)
+        else:
+            self._policy = with_view(experiment.ego[0], policy)
+        self._as_read = map_of(experiment, town)
+        self.town = with_zones(experiment, self._as_read)
+        self._egos = egos_of(experiment, self.town, self._policy)
+        self._placed = script_vehicles(experiment, self.town, self._egos)
+        self._script = script_of(experiment, self._as_read.network, self.town, self.egos)
         self._measure = self._measures(tuple(metrics))
         self.units = self._units()
         self._check_success()
-        self._demand = demand_of(experiment, self.town, self._egos, drivers)
+        self._demand = demand_of(experiment, self.town, self._egos, drivers, self._placed)
         for doubt in doubts(experiment, self.town):
             warnings.warn(doubt, stacklevel=2)
         self._check_room()
@@ -123,7 +132,7 @@ class Episodes:
         run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
         source, slots = _source_hash(), experiment.slots
         names = (
-            describe_program(source, self._demand, self._egos, slots),
+            describe_program(source, self._demand, self._egos, self._placed, self._script, slots),
             describe_program(source, replace(run, horizon=1.0)),  # programs run for any time
         )
         self.worlds = Worlds(run, self.lane_map, self.sample, chunk=self.chunk, names=names)
@@ -158,7 +167,7 @@ class Episodes:
         """The same worlds under another policy."""
         values: dict[str, Any] = self._values | {"policy": policy}
         return Episodes(
-            self.experiment, chunk=self.chunk, town=self.town, name=policy_name(policy), **values
+            self.experiment, chunk=self.chunk, town=self._as_read, name=policy_name(policy), **values
         )  # fmt: skip
 
     def _measures(self, metrics: tuple[Metric, ...]) -> EvaluateEgo | EvaluateTraffic:
@@ -179,7 +188,10 @@ class Episodes:
         units = dict(self._measure.units)
         if self.experiment.success and "success" not in units:
             units = {"success": "1 if the criteria of the experiment are met"} | units
-        return units | {total.name: total.meaning for total in TOTALS}
+        units |= {total.name: total.meaning for total in TOTALS}
+        if self._script is not None and self._script.actions is not None:
+            units[_BEGUN] = "share of the actions of the experiment that have begun"
+        return units
 
     def _refuse(self, field: str, message: str) -> NoReturn:
         raise ExperimentError(f"{self.experiment.name}: {field}: {message}")
@@ -195,6 +207,7 @@ class Episodes:
     def _check_room(self) -> None:
         placed = self._egos is not None and self._egos.lane is not None
         room = self._demand.initial + (self.egos if placed else 0)
+        room += 0 if self._placed is None else self._placed.count
         if room > self.experiment.slots:
             self._refuse("slots", f"{self.experiment.slots}, but {room} vehicles are there at the start")
         if not placed and room < self.egos:
@@ -216,7 +229,8 @@ class Episodes:
         It is traced once: what is wrong with it is one line, not a trace of a compiler."""
         if not is_foreign(self._policy):
             return None
-        if type(self._policy).__module__.startswith("limsim_jax."):
+        ours = type(self._policy).__module__.startswith("limsim_jax.")
+        if ours and not isinstance(self._policy, Several):
             return policy_code(self._policy)
 
         def start(key: jax.Array) -> State:
@@ -232,7 +246,10 @@ class Episodes:
 
     def sample(self, key: jax.Array) -> Scenario:
         """The scenario of a world."""
-        return sample_scenario(self._demand, self.lane_map, key, self.experiment.slots, self._egos)
+        return sample_scenario(
+            self._demand, self.lane_map, key, self.experiment.slots, self._egos,
+            vehicles=self._placed, script=self._script,
+        )  # fmt: skip
 
     def _memory(self) -> int:
         """Bytes that one more world needs: its arrays at the start, and temporaries in proportion."""
@@ -261,6 +278,7 @@ class Episodes:
             **({"policy": without_sources(describe(policy))} if policy is not None else {}),
             **({"policy_code": self._code} if self._code else {}),
             **({"knows": knows(self._policy)} if self.egos else {}),
+            **self._policies(),
             "experiment": self.experiment.model_dump(mode="json", exclude={"map"}),
             "map": {"file": os.path.basename(self.network.source), "hash": self.network.file_hash},
             "map_file": self._map_file(),
@@ -281,6 +299,12 @@ class Episodes:
             },
         }
 
+    def _policies(self) -> dict[str, list[str]]:
+        """The policies of egos that have one each."""
+        if not isinstance(self._policy, Several):
+            return {}
+        return {"policies": list(self._policy.names), "each_knows": [knows(x) for x in self._policy.policies]}
+
     def _map_file(self) -> str:
         """Where to find the map again: a bundled one by its name."""
         name = self.experiment.map
@@ -295,7 +319,7 @@ class Episodes:
         if len(seeds) > self.chunk:
             raise ValueError(f"{len(seeds)} seeds at once; at most {self.chunk}")
         (_, result), *_ = self.worlds.chunks(seeds)
-        metrics = self._columns(result.measures, result.totals)
+        metrics = self._columns(result)
         each = max(self.egos, 1)
         rows = np.repeat(np.asarray(seeds, np.int64), each)
         egos = np.tile(np.arange(each, dtype=np.int32), len(seeds))
@@ -307,12 +331,14 @@ class Episodes:
             digest=_digest(metrics, result.state, each),
         )
 
-    def _columns(self, measures: Any, totals: Totals) -> dict[str, NDArray[np.float64]]:
+    def _columns(self, result: Result) -> dict[str, NDArray[np.float64]]:
         """Columns with a row per world and ego, `[W E]`."""
-        found: dict[str, NDArray[np.float64]] = dict(on_host(measures))
+        found: dict[str, NDArray[np.float64]] = dict(on_host(result.measures))
         for column in TOTALS:
-            counted = getattr(totals, column.name.removeprefix("traffic_"))
+            counted = getattr(result.totals, column.name.removeprefix("traffic_"))
             found[column.name] = np.asarray(counted, float)
+        if result.state.script is not None:
+            found[_BEGUN] = np.isfinite(np.asarray(result.state.script.begun)).mean(-1)
         each = max(self.egos, 1)
         metrics = {name: x.ravel() if x.ndim == 2 else np.repeat(x, each) for name, x in found.items()}
         if self.experiment.success:
@@ -370,7 +396,7 @@ class Episodes:
         """At most a chunk of replays."""
         enough = Watch([ego for _, ego in which], AFTERWARDS) if brief else None
         result = self._reruns.replay([seed for seed, _ in which], enough)
-        columns = self._columns(result.measures, result.totals)
+        columns = self._columns(result)
         found = []
         for k, (seed, ego) in enumerate(which):
             row = k * max(self.egos, 1) + ego

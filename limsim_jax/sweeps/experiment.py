@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
-    ConfigDict,
     Field,
     ValidationError,
     field_serializer,
@@ -22,10 +21,18 @@ from pydantic import (
 )
 
 from limsim_jax.policies.view import view_of
+from limsim_jax.sweeps.script_file import (
+    ActionTable,
+    NotNegative,
+    ObstacleTable,
+    PlacedTable,
+    Positive,
+    Table,
+    VehicleTable,
+    ZoneTable,
+)
 from limsim_jax.traffic.collision import AfterCollision
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=60)]
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -41,11 +48,7 @@ class ExperimentError(ValueError):
     """An experiment cannot be run as it stands; one line that names file and field."""
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-
-class FlowTable(_Table):
+class FlowTable(Table):
     """Vehicles that come in: see `traffic.demand.Flow`."""
 
     origin: str | list[str] = "*"
@@ -66,7 +69,7 @@ class FlowTable(_Table):
     """s"""
 
 
-class TrafficTable(_Table):
+class TrafficTable(Table):
     """All vehicles but the egos."""
 
     vehicles: Annotated[int, Field(ge=0)] | None = None
@@ -89,17 +92,11 @@ class TrafficTable(_Table):
         return self
 
 
-class EgoTable(_Table):
+class EgoTable(PlacedTable):
     """The vehicle under test."""
 
     start: str = "random"
     """An entry of the map, a road or lane id; "random": the place and goal of some vehicle at the start."""
-    lane: Annotated[int, Field(ge=0)] = 0
-    """Which of the lanes there, from the right."""
-    s: NotNegative = 10.0
-    """m along the lane, front bumper."""
-    v: NotNegative | None = None
-    """m/s; absent: as fast as road and leader allow."""
     goal: str | None = None
     """Where it goes: a way out of the map or a lane id. Not with a random start."""
     policy: str = "like_traffic"
@@ -110,9 +107,6 @@ class EgoTable(_Table):
     """What the policy sees: fields of `policies.view.View`."""
     privileged: bool | None = None
     """Whether the policy gets the true state instead of a view; absent: as the policy says."""
-    vehicle: str = "car"
-    driver: dict[str, float] = Field(default_factory=dict)
-    """Fields of `types.Driver` that differ from those of a typical driver."""
 
     @model_validator(mode="after")
     def _goal_belongs_to_start(self) -> EgoTable:
@@ -131,14 +125,14 @@ class EgoTable(_Table):
         return found
 
 
-class Bounds(_Table):
+class Bounds(Table):
     """What a metric must keep to."""
 
     min: float | None = None
     max: float | None = None
 
 
-class ExperimentFile(_Table):
+class ExperimentFile(Table):
     """One experiment. `Field`s have the units that their descriptions say."""
 
     name: Name
@@ -156,6 +150,11 @@ class ExperimentFile(_Table):
     traffic: TrafficTable = TrafficTable()
     ego: tuple[EgoTable, ...] = (EgoTable(),)
     """The vehicle under test, several as `[[ego]]`, or none: `ego = false`."""
+    vehicle: list[VehicleTable] = Field(default_factory=list)
+    """Vehicles with a place, and actions, of their own."""
+    obstacle: list[ObstacleTable] = Field(default_factory=list)
+    zone: list[ZoneTable] = Field(default_factory=list)
+    """Closed lanes, and speed limits and friction that differ from the map's."""
     success: dict[str, bool | int | float | Bounds] = Field(default_factory=dict)
     """What counts as success: metrics with the value or the bounds they must keep; absent: to arrive
     without a contact and without leaving the road."""
@@ -167,14 +166,6 @@ class ExperimentFile(_Table):
             return ()
         return tuple(found) if isinstance(found, list | tuple) else (found,)
 
-    @field_validator("ego")
-    @classmethod
-    def _one_policy(cls, egos: tuple[EgoTable, ...]) -> tuple[EgoTable, ...]:
-        for ego in egos[1:]:
-            if any(getattr(ego, name) != getattr(egos[0], name) for name in _OF_POLICY):
-                raise ValueError(f"one policy drives all egos; here are {egos[0].policy} and {ego.policy}")
-        return egos
-
     @field_serializer("ego")
     def _as_written(self, egos: tuple[EgoTable, ...]) -> Any:
         plain = [ego.model_dump(mode="json") for ego in egos]
@@ -182,8 +173,16 @@ class ExperimentFile(_Table):
 
     @property
     def policy(self) -> str:
-        """Name of the policy, fit for a folder."""
-        return self.ego[0].policy.rpartition(":")[2] if self.ego else NO_POLICY
+        """Name of the policy or policies, fit for a folder."""
+        names = dict.fromkeys(ego.policy.rpartition(":")[2] for ego in self.ego)
+        return "-and-".join(names) or NO_POLICY
+
+    @property
+    def one_policy(self) -> bool:
+        """Whether all egos have the same policy with the same options."""
+        return all(
+            getattr(ego, name) == getattr(self.ego[0], name) for ego in self.ego[1:] for name in _OF_POLICY
+        )
 
 
 def bundled_experiments() -> dict[str, Path]:
@@ -307,6 +306,10 @@ def _fields_at(where: tuple[Any, ...]) -> list[str]:
         ("ego",): EgoTable,
         ("traffic",): TrafficTable,
         ("traffic", "flow"): FlowTable,
+        ("vehicle",): VehicleTable,
+        ("vehicle", "action"): ActionTable,
+        ("obstacle",): ObstacleTable,
+        ("zone",): ZoneTable,
     }
     table = tables.get(tuple(part for part in where if isinstance(part, str)))
     return list(table.model_fields) if table else []

@@ -52,9 +52,19 @@ from limsim_jax.traffic.neighbors import (
 )
 from limsim_jax.traffic.parameters import DRIVING, LANE_CHANGES
 from limsim_jax.traffic.right_of_way import approaches_ahead, give_way
+from limsim_jax.traffic.script import (
+    accelerate,
+    begin,
+    grip,
+    leaves,
+    limits_with_grip,
+    ordered_change,
+    with_grip,
+    without_speed,
+)
 from limsim_jax.traffic.signals import switch
 from limsim_jax.traffic.speeds import BEND_POINTS, bend_squares, lane_speed
-from limsim_jax.types import Config, Schedule, State, Status
+from limsim_jax.types import Actions, Config, Schedule, State, Status
 from limsim_jax.xla import computed_once, mapped_like
 
 
@@ -84,7 +94,12 @@ class Tick(NamedTuple):
 
 @jax.named_scope("decide")
 def decide(
-    config: Config, traffic: Traffic, lane_map: LaneMap, state: State, command: Command
+    config: Config,
+    traffic: Traffic,
+    lane_map: LaneMap,
+    state: State,
+    command: Command,
+    actions: Actions | None = None,
 ) -> tuple[State, Decision]:
     """Decide for all vehicles: leaders, right of way, lights, bends, lane changes.
 
@@ -94,6 +109,7 @@ def decide(
       lane_map: where.
       state: the world now.
       command: of the egos.
+      actions: that an experiment orders.
 
     Returns:
       The state, with lights switched and lane changes started, and what was decided.
@@ -133,8 +149,11 @@ def decide(
         choice = choice._replace(
             side=at_slots(state.egos, asked, choice.side, ~state.egos.free & (command.meta >= 0))
         )
+    if actions is not None:
+        state, asked, ordered = ordered_change(lane_map, actions, state)
+        choice = choice._replace(side=jnp.where(ordered, asked, choice.side))
     choice = computed_once(choice)
-    if traffic.lane_changes or command.meta is not None:
+    if traffic.lane_changes or command.meta is not None or actions is not None:
         state = start(lane_map, state, choice)
     approaches = approaches_ahead(config, lane_map, state, ahead)
     lights = switch(config, lane_map, state, approaches.lane, approaches.line)
@@ -315,7 +334,16 @@ def drive(
         state = replace(state, side=at_slots(state.egos, command.signal, state.side, shows))
     if schedule is not None:
         state = enter(config, lane_map, schedule, state)
-    state, decision = decide(config, traffic, lane_map, state, command)
+    script = None if schedule is None else schedule.script
+    actions = None if script is None or state.script is None else script.actions
+    dry = state.driver
+    if actions is not None:
+        state = begin(config, lane_map, actions, state)
+    if script is not None and script.zones is not None:
+        most = grip(config, script.zones, state)
+        state = replace(state, driver=with_grip(state.driver, most))
+        traffic = replace(traffic, limits=limits_with_grip(traffic.limits, most[state.egos.slot]))
+    state, decision = decide(config, traffic, lane_map, state, command, actions)
 
     # what no step changes stays out of the loop
     fixed = {name: getattr(state, name) for name in ("driver", "shape", "vehicle", "lights", "queues")}
@@ -326,7 +354,9 @@ def drive(
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], Any]:
         state, x = carry
         state = replace(state, **fixed)
-        state, dx, left, off = _step(config, traffic, lane_map, state, decision, x, command, broken, free)
+        state, dx, left, off = _step(
+            config, traffic, lane_map, state, decision, x, command, broken, free, actions
+        )
         x = x + dx
         tick = Tick(state, left, off, config.time(state.step), decision, x, dx, command)
         return (bare(state), x), None if record is None else record(tick)
@@ -334,6 +364,8 @@ def drive(
     before, x = state, mapped_like(state.s, jnp.zeros_like(state.s))
     (state, _), records = lax.scan(step, (bare(state), x), None, length=config.decision_every)
     state = replace(state, **fixed)
+    if script is not None:
+        state = replace(state, driver=replace(dry, lane_change_time=state.driver.lane_change_time))
     if traffic.look_for_contacts == "decision":
         state, _ = record_events(config, lane_map, state, free=free)
     if state.egos.slot.shape[0]:
@@ -351,13 +383,19 @@ def _step(
     command: Command,
     broken: Bool[Array, " E"],
     may_be_free: bool,
+    actions: Actions | None,
 ) -> tuple[State, Float[Array, " N"], Bool[Array, " N"], Bool[Array, " N"] | None]:
     """One physics step, `x` m after the decision.
 
     Returns the state, metres travelled, whether vehicles have left, and whether they are off the road.
     """
     egos = state.egos
+    if actions is not None:
+        state = begin(config, lane_map, actions, state)
+        decision = without_speed(config, actions, state, decision)
     a = accelerations(traffic.model, state, decision, x)
+    if actions is not None:
+        a = accelerate(config, actions, state, a)
     if command.meta is not None:
         told = meta_acceleration(jnp.maximum(command.meta, 0), state, a)
         a = at_slots(egos, told, a, ~egos.free & (command.meta >= 0))
@@ -375,6 +413,9 @@ def _step(
         free = step_free(config, lane_map, traffic.limits, state, control)
         a = jnp.where(is_free(state), free.a, a)
     moved, dx, left = advance(config, lane_map, state, a)
+    if actions is not None:
+        gone = leaves(actions, moved)
+        moved, left = without(moved, gone), left | gone
     if free is not None:
         dx = jnp.where(is_free(state), free.distance - state.distance, dx)
         left &= ~is_free(state)

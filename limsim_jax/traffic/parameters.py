@@ -442,6 +442,13 @@ class Driving:
         "chosen: s0",
         (0.0, 10.0),
     )
+    grip_share: float = _number(
+        0.5,
+        "1",
+        "share of the friction of a slippery road that drivers use outside emergencies",
+        "chosen: half is kept for what comes unexpectedly",
+        (0.2, 1.0),
+    )
 
 
 JUNCTIONS = Junctions()

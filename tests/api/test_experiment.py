@@ -52,7 +52,8 @@ def test_a_map_is_one_object():
         (dict(name="a b"), "a b: name: "),
         (dict(model="gipps"), "roundabout: traffic.model: "),
         (dict(mix={"car": -1.0}), "roundabout: traffic.mix.car: "),
-        (dict(ego=[lj.Ego(policy="pdm_closed"), lj.Ego()]), "one policy drives all egos"),
+        (dict(zones=[{"where": "1"}]), "zone.0: a zone needs closed, speed_limit or friction"),
+        (dict(placed=[lj.Ego()]), "vehicle.0"),
         (dict(ego=5), "roundabout: ego: "),
         (dict(ego=None, policy="pdm_closed"), "ego: there is none"),
         (dict(ego=None, policy=lj.LikeTraffic()), "policy: there is no ego"),
@@ -88,7 +89,7 @@ def test_fields_of_flows_and_egos_are_checked_where_they_are_written():
     with pytest.raises(lj.ExperimentError, match="Ego: a goal is missing"):
         lj.Ego(start="1-")
     with pytest.raises(lj.ExperimentError, match="Ego: speed: no such field"):
-        lj.Ego(speed=3.0)
+        lj.Ego(speed=3.0)  # pyright: ignore[reportCallIssue]
 
 
 def test_several_experiments_are_swept_not_run():

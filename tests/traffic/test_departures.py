@@ -165,7 +165,7 @@ def test_entering_resets_the_slot():
         v=jnp.asarray([17.0]), goal=jnp.asarray([GOAL]),
     )  # fmt: skip
     fresh = dataclasses.replace(fresh, vehicle=jnp.asarray([0]), entered=jnp.asarray([1.0], jnp.float32))
-    world = ("step", "queues", "lights", "egos")
+    world = ("step", "queues", "lights", "egos", "script")
     for field in dataclasses.fields(fresh):
         if field.name in world:
             continue

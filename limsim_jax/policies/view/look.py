@@ -211,6 +211,7 @@ def _believed(state: State, mine: Bool[Array, " N"], drivers: Seen) -> State:
         driver=jax.tree.map(own, state.driver, believed(drivers, state.shape.vehicle_class)),
         queues=jax.tree.map(jnp.zeros_like, state.queues),
         lights=replace(lights, elapsed=none, gap=none),
+        script=None,
         **{name: own(getattr(state, name), guess) for name, guess in _HIDDEN.items()},
     )
 

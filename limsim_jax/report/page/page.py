@@ -55,6 +55,7 @@ from limsim_jax.report.tables import (
     groups,
     knows,
     lookup,
+    provenance_of,
     short_list,
     summary,
     worst,
@@ -312,7 +313,7 @@ def _full_cell(row: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 def _provenance(results: Results, group: Group, part: pa.Table, names: Names) -> dict[str, Any]:
     facts = [("seeds", _seeds(part["seed"].to_numpy()), False)]
-    facts += [(str(k), *_fact(v)) for k, v in results.provenance.get(group, {}).items()]
+    facts += [(str(k), *_fact(v)) for k, v in provenance_of(results, group).items()]
     return {"label": names.label(group), "facts": facts}
 
 

@@ -42,6 +42,7 @@ def build_demand(
     density: float = 0.0,
     vehicles: int | None = None,
     egos: EgoStart | None = None,
+    placed: EgoStart | None = None,
 ) -> Demand:
     """Check flows and density, and lay them out for the device.
 
@@ -56,6 +57,7 @@ def build_demand(
       density: vehicles at the start per km of lane outside junctions.
       vehicles: instead of that, how many there are at the start.
       egos: vehicles under test; no other vehicle starts within `EGO_ROOM` on their lanes, or touches them.
+      placed: other vehicles with a place of their own, for which the same holds.
 
     Raises:
       ValueError: an unknown or unreachable origin or goal, a number out of range, a lane that is open to
@@ -71,15 +73,17 @@ def build_demand(
     streams: list[Stream] = []
     for i, flow in enumerate(flows):
         streams += streams_of(tables, flow, i, horizon)
+    kept = [(x.lane, x.s) for x in (egos, placed) if x is not None and x.lane is not None]
+    taken = np.concatenate([np.array(x, float) for x in [np.zeros((2, 0)), *kept]], 1)
     wanted = sum((s.rate * s.goals for s in streams), np.zeros(tables.reachable.shape[1]))
     if vehicles is None:
-        seats = lay_out_seats(tables, density, wanted, egos)
+        seats = lay_out_seats(tables, density, wanted, taken)
     else:
         km = sum(lane.length for lane in network.drivable_lanes() if lane.junction is None) / 1e3
         density = vehicles / max(km, 1e-3)
-        seats = lay_out_seats(tables, density, wanted, egos)
+        seats = lay_out_seats(tables, density, wanted, taken)
         if seats["initial"] not in (0, vehicles):  # lanes that are closed to all types have no places
-            seats = lay_out_seats(tables, density * vehicles / seats["initial"], wanted, egos)
+            seats = lay_out_seats(tables, density * vehicles / seats["initial"], wanted, taken)
     arrays = _lay_out(tables, streams) | seats
     return jax.tree.map(jnp.asarray, Demand(population=population, **arrays))
 

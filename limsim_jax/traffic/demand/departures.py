@@ -86,7 +86,7 @@ def enter(config: Config, lane_map: LaneMap, schedule: Schedule, state: State) -
         active=taken,
     )
     fresh = replace(fresh, vehicle=mine, entered=jnp.full(n, now))
-    world = {"step", "queues", "lights", "egos"}
+    world = {"step", "queues", "lights", "egos", "script"}
     changed = {
         x.name: jax.tree.map(
             lambda new, old: jnp.where(taken, new, old), getattr(fresh, x.name), getattr(state, x.name)

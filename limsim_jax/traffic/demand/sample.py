@@ -24,10 +24,11 @@ from limsim_jax.traffic.demand.arrays import FLOW_BITS, NEVER, Demand, EgoStart
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.neighbors import neighbors, sort_vehicles
+from limsim_jax.traffic.script import no_progress
 from limsim_jax.traffic.speeds import BEND_POINTS, bend_squares, lane_speed
 from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import BODY, PARAMETERS, Population, sample_vehicles
-from limsim_jax.types import Config, Driver, Queues, Scenario, Schedule, Shape, State
+from limsim_jax.types import Config, Driver, Queues, Scenario, Schedule, Script, Shape, State, Status
 
 _DEAD_END_ROOM = 12.0  # m before the end of a lane that leads nowhere, kept free to change lanes
 _LOOK = 4  # lanes ahead of the departure lane that limit the speed
@@ -40,7 +41,14 @@ _ARRIVALS, _SEATS, _ROLES, _VEHICLES = range(4)
 
 
 def sample_scenario(
-    demand: Demand, lane_map: LaneMap, key: Key[Array, ""], slots: int, egos: EgoStart | None = None
+    demand: Demand,
+    lane_map: LaneMap,
+    key: Key[Array, ""],
+    slots: int,
+    egos: EgoStart | None = None,
+    *,
+    vehicles: EgoStart | None = None,
+    script: Script | None = None,
 ) -> Scenario:
     """Draw one world: the vehicles at the start, and those that enter later.
 
@@ -50,12 +58,16 @@ def sample_scenario(
       key: of the tables.
       slots: number of vehicle slots `N`.
       egos: the ones that the demand was built with; they are in slots 0 to `E - 1`.
+      vehicles: of the script, in the slots behind the egos, with the speeds that they have; NaN: as fast as
+        road and leader allow.
+      script: what happens by order.
 
     Raises:
       ValueError: more vehicles at the start than slots.
     """
     placed = egos is not None and egos.lane is not None
     initial = demand.initial + (egos.count if egos is not None and placed else 0)
+    initial += 0 if vehicles is None else vehicles.count
     if egos is not None and initial < egos.count:
         raise ValueError(f"{egos.count} egos cannot take the places of {initial} vehicles at the start")
     if initial > slots:
@@ -87,9 +99,17 @@ def sample_scenario(
     schedule = Schedule(
         time=time, lane=lane, s=s, v=v, goal=goal, driver=driver, shape=shape, start=demand.start
     )
+    first = 0 if egos is None else egos.count
     if egos is not None:
         now = _with_egos(lane_map, egos, now)
+    if vehicles is not None:
+        now = _with_vehicles(lane_map, vehicles, first, now)
     state = _start(demand, lane_map, slots, *now)
+    if vehicles is not None:
+        state = _by_script(state, vehicles, first)
+    if script is not None:
+        schedule = replace(schedule, script=script)
+        state = replace(state, script=None if script.actions is None else no_progress(script.actions))
     if egos is not None:
         box = boxes(lane_map, state)
         state = replace(state, egos=from_lane(lane_map, state, box, range(egos.count), egos.free))
@@ -106,6 +126,26 @@ def _with_egos(lane_map: LaneMap, egos: EgoStart, others: tuple[Any, ...]) -> tu
     v = v if egos.v is None else jnp.minimum(egos.v, v)
     first = egos.driver, egos.shape, lane, s, v, goal
     return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), first, rest)
+
+
+def _with_vehicles(
+    lane_map: LaneMap, vehicles: EgoStart, first: int, others: tuple[Any, ...]
+) -> tuple[Any, ...]:
+    """Put the vehicles of a script behind the `first` ones."""
+    lane, s, goal = vehicles.lane, vehicles.s, vehicles.goal
+    assert lane is not None and s is not None and goal is not None
+    v = entry_speed(lane_map, vehicles.driver, lane, s, goal)
+    mine = vehicles.driver, vehicles.shape, lane, s, v, goal
+    return jax.tree.map(lambda x, new: jnp.concatenate([x[:first], new, x[first:]]), others, mine)
+
+
+def _by_script(state: State, vehicles: EgoStart, first: int) -> State:
+    """The state with the speeds that a script says."""
+    part = slice(first, first + vehicles.count)
+    assert vehicles.v is not None
+    v = jnp.where(jnp.isnan(vehicles.v), state.v[part], vehicles.v)
+    status = state.status.at[part].set(int(Status.SCRIPTED))
+    return replace(state, v=state.v.at[part].set(v), status=status)
 
 
 def overflow(demand: Demand, key: Key[Array, ""]) -> Bool[Array, ""]:

@@ -17,7 +17,6 @@ from limsim_jax.maps.lane_map import (
     bucket,
 )
 from limsim_jax.maps.network import Lane
-from limsim_jax.traffic.demand.arrays import EgoStart
 from limsim_jax.traffic.demand.tables import Tables, cumulative
 
 EGO_ROOM = 10.0
@@ -28,11 +27,12 @@ _MARGIN = 2.0  # m from the bodies of vehicles at the start to both ends of thei
 
 
 def lay_out_seats(
-    tables: Tables, density: float, wanted: NDArray[np.float64], egos: EgoStart | None
+    tables: Tables, density: float, wanted: NDArray[np.float64], taken: NDArray[np.float64]
 ) -> dict[str, Any]:
     """Lay out places at the start, about two per vehicle.
 
     `wanted` is the traffic to every goal: goals are drawn in these proportions where they can be reached.
+    `taken` are lanes and places (m) of front bumpers of vehicles that stand there already, `[2 P]`.
     """
     lanes = [lane for lane in tables.network.drivable_lanes() if lane.junction is None]
     open_to = {lane.id: tables.allowed[tables.rows[lane.id]] @ tables.shares for lane in lanes}
@@ -42,10 +42,10 @@ def lay_out_seats(
     if initial:
         least = tables.lengths[1] + _CLEAR
         pitch = max(least, 500 / density)
-        row, s, slack = _places(tables, lanes, pitch, egos)
+        row, s, slack = _places(tables, lanes, pitch, taken)
         while len(row) < 1.5 * initial and pitch > least:
             pitch = max(least, 0.85 * pitch)
-            row, s, slack = _places(tables, lanes, pitch, egos)
+            row, s, slack = _places(tables, lanes, pitch, taken)
     if len(row) < initial:
         raise ValueError(
             f"density = {density:g} veh/km puts {initial} vehicles on the roads at the start, "
@@ -68,7 +68,7 @@ def lay_out_seats(
 
 
 def _places(
-    tables: Tables, lanes: list[Lane], pitch: float, egos: EgoStart | None
+    tables: Tables, lanes: list[Lane], pitch: float, taken: NDArray[np.float64]
 ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
     """Places `pitch` m apart: row, hindmost front bumper (m) and room from there (m).
 
@@ -85,10 +85,7 @@ def _places(
     useful = tables.leaves_room(row, s + slack).any(1)
     useful &= (tables.allowed[row] & _fits(tables, lanes, row, s, slack) & (tables.shares > 0)).any(1)
     row, s, slack = row[useful], s[useful], slack[useful]
-    # egos come first, and of two places that touch the first is kept
-    taken = np.zeros((2, 0))
-    if egos is not None and egos.lane is not None:
-        taken = np.array([egos.lane, egos.s], float)
+    # places that are taken come first, and of two places that touch the first is kept
     near = (row[:, None] == taken[0]) & (s[:, None] - longest < taken[1] + EGO_ROOM)
     near &= (s + slack)[:, None] > taken[1] - longest - EGO_ROOM
     row, s, slack = (x[~near.any(1)] for x in (row, s, slack))
