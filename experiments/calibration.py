@@ -23,16 +23,8 @@ from differential_evolution import fit_by_evolution
 from scipy.optimize import differential_evolution
 
 from limsim_jax.calibration.cleaning import Segment
-from limsim_jax.calibration.fit import (
-    LOWER,
-    METHODS,
-    MODELS,
-    PARAMETERS,
-    UPPER,
-    errors,
-    fit,
-    stack,
-)
+from limsim_jax.calibration.fit import METHODS, MODELS, errors, fit, stack
+from limsim_jax.calibration.parameters import BOX, PARAMETERS
 from limsim_jax.calibration.report import PUBLISHED, calibrate, gather
 from limsim_jax.calibration.synthetic import drivers, follow
 from limsim_jax.calibration.uncertainty import uncertainty
@@ -73,7 +65,6 @@ def timed(segments: list[Segment], model: str, method: str) -> tuple[Any, float]
 def scipy_de(segments: list[Segment], model: str, count: int) -> tuple[np.ndarray, float]:
     """Errors and seconds per driver of SciPy's differential evolution."""
     _, data, dt = stack(segments)
-    low, high = np.asarray(LOWER), np.asarray(UPPER)
     one = jax.tree.map(lambda x: jnp.asarray(x[0]), data)
 
     @jax.jit
@@ -91,7 +82,7 @@ def scipy_de(segments: list[Segment], model: str, count: int) -> tuple[np.ndarra
 
         result = differential_evolution(
             cost,
-            list(zip(low, high, strict=True)),
+            list(zip(*BOX, strict=True)),
             maxiter=100,
             vectorized=True,
             updating="deferred",

@@ -22,8 +22,8 @@ from limsim_jax.calibration.closed_loop import (
     calibrate_closed_loop,
     linked_recordings,
 )
-from limsim_jax.calibration.fit import PARAMETERS
 from limsim_jax.calibration.matching import Engine, TrafficFlow, match
+from limsim_jax.calibration.parameters import PARAMETERS
 from limsim_jax.calibration.report import gather
 from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, bundled_maps, read_network

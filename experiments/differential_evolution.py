@@ -16,7 +16,8 @@ from jaxtyping import Array, Key
 from scipy.stats import qmc
 
 from limsim_jax.calibration.cleaning import Segment
-from limsim_jax.calibration.fit import PARAMETERS, Data, Fit, Problem, boxed, cost, stack
+from limsim_jax.calibration.fit import Data, Fit, Problem, cost, stack
+from limsim_jax.calibration.parameters import BOX, PARAMETERS
 from limsim_jax.traffic.car_following import IDM, CarFollowing
 
 MEMBERS = 15
@@ -45,7 +46,7 @@ def fit_by_evolution(
     error = np.sqrt(np.asarray(costs, float))
     return Fit(
         model=model, objective=objective, method="de", drivers=drivers,
-        parameters=np.asarray(boxed(u), float), error=error, starts=error[:, None],
+        parameters=BOX.parameters(np.asarray(u, float)), error=error, starts=error[:, None],
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 

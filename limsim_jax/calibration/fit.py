@@ -2,7 +2,7 @@
 
 The follower drives behind the *recorded* leader from its recorded start, with the models and the ballistic
 step of the simulator itself (`traffic.car_following`), and its gap is compared with the recorded one
-(Kesting, Treiber 2008, arXiv 0803.4063). Parameters live in the box from `LOWER` to `UPPER`, and the
+(Kesting, Treiber 2008, arXiv 0803.4063). Parameters live in a box (`parameters.BOUNDS`), and the
 derivatives of a rollout by them are five forward-mode products, with no tape over its steps.
 
 Methods, behind one function `fit`:
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, NamedTuple
@@ -30,15 +30,9 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from limsim_jax.calibration.cleaning import Segment, by_driver
+from limsim_jax.calibration.parameters import BOX, PARAMETERS, Box
 from limsim_jax.traffic.car_following import ACC, IDM, IIDM, CarFollowing, ballistic
 from limsim_jax.types import Driver
-
-PARAMETERS = ("v0", "T", "s0", "a", "b")
-"""m/s, s, m, m/s^2, m/s^2; axis `P`."""
-
-LOWER = (5.0, 0.3, 0.5, 0.3, 0.5)
-UPPER = (45.0, 4.0, 8.0, 4.0, 5.0)
-"""The box of the parameters."""
 
 MODELS: dict[str, CarFollowing] = {"idm": IDM(), "iidm": IIDM(), "acc": ACC()}
 """By the names that files and the command line have for them."""
@@ -205,18 +199,6 @@ def errors(
     return jax.vmap(one)(parameters, data)
 
 
-def boxed(u: Float[Array, "*B P"]) -> Float[Array, "*B P"]:
-    """Parameters of a point of the unit box."""
-    low, high = (jnp.broadcast_to(jnp.asarray(bound, u.dtype), u.shape) for bound in (LOWER, UPPER))
-    return low + (high - low) * u
-
-
-def unboxed(parameters: NDArray[Any]) -> NDArray[np.float64]:
-    """Point of the unit box; parameters outside are put on its bounds."""
-    low, high = np.asarray(LOWER), np.asarray(UPPER)
-    return np.clip((np.asarray(parameters, float) - low) / (high - low), 0, 1)
-
-
 # --- methods -----------------------------------------------------------------------------------------
 
 
@@ -226,6 +208,7 @@ class Problem(NamedTuple):
     model: CarFollowing
     objective: str
     dt: float  # s
+    box: Box = BOX
 
 
 class Prior(NamedTuple):
@@ -238,7 +221,7 @@ class Prior(NamedTuple):
 
 def _residuals(problem: Problem, u: Array, data: Data, prior: Prior | None) -> Array:
     """Residuals whose sum of squares is the cost."""
-    p = boxed(u)
+    p = problem.box.parameters(u)
     gap, v = rollout(problem.model, p, data, problem.dt)
     r = residuals(problem.objective, gap, v, data) / jnp.sqrt(jnp.maximum(jnp.sum(data.weight), 1))
     if prior is None:
@@ -433,6 +416,11 @@ class Fit:
     error: NDArray[np.float64]  # [D], the objective
     starts: NDArray[np.float64]  # [D, S], the objective that each start came to
     seconds: float  # compilation included
+    box: Box = BOX  # in which the parameters were searched
+
+    def problem(self, dt: float) -> Problem:
+        """The problem that this solves, with a time step in s."""
+        return Problem(self.model, self.objective, dt, self.box)
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         """One parameter, `[D]`."""
@@ -447,6 +435,7 @@ def fit(
     method: str = "lm",
     starts: int | None = None,
     iterations: int | None = None,
+    bounds: Mapping[str, Sequence[float]] | None = None,
     seed: int = 0,
     samples: int = 0,
 ) -> Fit:
@@ -460,11 +449,12 @@ def fit(
       starts: descents per driver, each from the best of 32 quasi-random points. Default: 8
         with the IDM, 16 with the others, whose kinks give them more local minima.
       iterations: at most, from the best start. Default: 80 (lm), 60 (lbfgs), 300 (adam).
+      bounds: of some parameters, instead of those in `parameters.BOUNDS`; see `parameters.Box.of`.
       seed: of the random points.
       samples: see `stack`.
 
     Raises:
-      ValueError: no segments, or an unknown objective or method.
+      ValueError: no segments, an unknown objective or method, or impossible bounds.
     """
     for what, value, known in (
         ("objective", objective, OBJECTIVES),
@@ -472,9 +462,10 @@ def fit(
     ):
         if value not in known:
             raise ValueError(f"{what} '{value}' is unknown; known are {', '.join(known)}")
+    box = Box.of(bounds)
     begin = time.perf_counter()
     drivers, data, dt = stack(segments, samples)
-    u, costs = solve(Problem(model, objective, dt), data, method, starts, iterations, seed)
+    u, costs = solve(Problem(model, objective, dt, box), data, method, starts, iterations, seed)
     best = np.argmin(costs, axis=-1)
     rows = np.arange(len(drivers))
     return Fit(
@@ -482,15 +473,12 @@ def fit(
         objective=objective,
         method=method,
         drivers=drivers,
-        parameters=_parameters(u[rows, best]),
+        parameters=box.parameters(u[rows, best]),
         error=np.sqrt(costs[rows, best]),
         starts=np.sqrt(costs),
         seconds=time.perf_counter() - begin,
+        box=box,
     )
-
-
-def _parameters(u: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(LOWER) + (np.asarray(UPPER) - np.asarray(LOWER)) * u
 
 
 def solve(
@@ -537,24 +525,20 @@ def refine(
     problem: Problem, data: Data, parameters: NDArray[Any], prior: Prior, iterations: int = 25
 ) -> NDArray[np.float64]:
     """Parameters `[D, P]` of greatest posterior density near the given ones."""
-    u = jnp.asarray(unboxed(parameters), jnp.float32)[:, None]
+    u = jnp.asarray(problem.box.unit(parameters), jnp.float32)[:, None]
     prior = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), prior)
     u, _ = _levenberg_marquardt(problem, u, jax.tree.map(jnp.asarray, data), prior, iterations, 1e-5)
-    return _parameters(np.asarray(u[:, 0], float))
+    return problem.box.parameters(np.asarray(u[:, 0], float))
 
 
 __all__ = [
-    "LOWER",
     "METHODS",
     "MODELS",
     "OBJECTIVES",
-    "PARAMETERS",
-    "UPPER",
     "Data",
     "Fit",
     "Prior",
     "Problem",
-    "boxed",
     "cost",
     "driver",
     "errors",
@@ -565,5 +549,4 @@ __all__ = [
     "rollout",
     "solve",
     "stack",
-    "unboxed",
 ]

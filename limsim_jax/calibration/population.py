@@ -26,20 +26,8 @@ from jaxtyping import Array, Float, Key
 from numpy.typing import NDArray
 
 from limsim_jax.calibration.cleaning import Segment
-from limsim_jax.calibration.fit import (
-    LOWER,
-    PARAMETERS,
-    UPPER,
-    Data,
-    Fit,
-    Prior,
-    Problem,
-    driver,
-    model_name,
-    refine,
-    rollout,
-    stack,
-)
+from limsim_jax.calibration.fit import Data, Fit, Prior, driver, model_name, refine, rollout, stack
+from limsim_jax.calibration.parameters import BOX, PARAMETERS, Box
 from limsim_jax.calibration.uncertainty import Uncertainty, uncertainty
 from limsim_jax.files import write_whole
 from limsim_jax.traffic.car_following import CarFollowing
@@ -79,9 +67,11 @@ class Law:
     posterior_mean: Floats  # [D P], of log-parameters
     posterior_covariance: Floats  # [D P P]
     identified: Floats  # [P], share of the drivers
+    bound_shares: Floats  # [2 P], of the drivers, see `Uncertainty`
     model: CarFollowing
     objective: str
     residual: Residual
+    box: Box = BOX
 
     @property
     def median(self) -> dict[str, float]:
@@ -103,7 +93,7 @@ class Law:
     def sample(self, count: int, rng: np.random.Generator) -> Floats:
         """Parameters of new drivers, `[count P]`, within the box."""
         drawn = rng.multivariate_normal(self.mean, self.covariance, count)
-        return np.clip(np.exp(drawn), LOWER, UPPER)
+        return np.clip(np.exp(drawn), *self.box)
 
 
 def estimate(fit: Fit, segments: Sequence[Segment], *, rounds: int = 3, samples: int = 0) -> Law:
@@ -120,14 +110,13 @@ def estimate(fit: Fit, segments: Sequence[Segment], *, rounds: int = 3, samples:
     """
     if len(fit.drivers) < FEW:
         raise ValueError(f"a population from {len(fit.drivers)} drivers; at least 3 are needed")
-    found = uncertainty(fit, segments, samples=samples)
-    identified = found.identified.mean(axis=0)
+    known = found = uncertainty(fit, segments, samples=samples)
     log_p = np.log(fit.parameters)
     information = _censored(found)
     pull = np.einsum("dij,dj->di", information, log_p)
-    mean, covariance, posterior, spread = _expectation_maximisation(information, pull)
+    mean, covariance, posterior, spread = _expectation_maximisation(information, pull, fit.box)
     drivers, data, dt = stack(segments, samples)
-    problem = Problem(fit.model, fit.objective, dt)
+    problem = fit.problem(dt)
     for _ in range(rounds):
         parameters = refine(
             problem, data, np.exp(posterior), _prior(mean, covariance, found, data)
@@ -138,18 +127,20 @@ def estimate(fit: Fit, segments: Sequence[Segment], *, rounds: int = 3, samples:
         slope = (log_p - mean) @ np.linalg.inv(covariance)
         information = _censored(found)
         pull = np.einsum("dij,dj->di", information, log_p) + np.where(found.at_bound, 0.0, slope)
-        mean, covariance, posterior, spread = _expectation_maximisation(information, pull)
-    parameters = np.clip(np.exp(posterior), LOWER, UPPER)
+        mean, covariance, posterior, spread = _expectation_maximisation(information, pull, fit.box)
+    parameters = np.clip(np.exp(posterior), *fit.box)
     return Law(
         mean=mean,
         covariance=covariance,
         drivers=drivers,
         posterior_mean=posterior,
         posterior_covariance=spread,
-        identified=identified,
+        identified=known.identified.mean(axis=0),
+        bound_shares=known.bound_shares,
         model=fit.model,
         objective=fit.objective,
         residual=residual_process(fit.model, parameters, data, dt),
+        box=fit.box,
     )
 
 
@@ -170,9 +161,11 @@ def few_drivers(fit: Fit, known: Uncertainty, segments: Sequence[Segment]) -> La
         posterior_mean=log_p,
         posterior_covariance=np.zeros((*log_p.shape, log_p.shape[1])),
         identified=known.identified.mean(axis=0),
+        bound_shares=known.bound_shares,
         model=fit.model,
         objective=fit.objective,
         residual=residual_process(fit.model, fit.parameters, data, dt),
+        box=fit.box,
     )
 
 
@@ -205,13 +198,13 @@ def _prior(mean: Floats, covariance: Floats, found: Uncertainty, data: Data) -> 
 
 
 def _expectation_maximisation(
-    information: Floats, pull: Floats, iterations: int = 300
+    information: Floats, pull: Floats, box: Box, iterations: int = 300
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Mean and covariance; posterior means `[D P]` and covariances of the drivers.
 
     A driver's log-likelihood is Gaussian: `-x^T information x / 2 + pull^T x`.
     """
-    low, high = np.log(LOWER), np.log(UPPER)
+    low, high = np.log(box)
     centre = (low + high) / 2
     mean, covariance = centre, np.diag(((high - low) / 4) ** 2)
     count, size = pull.shape
@@ -300,7 +293,7 @@ def predictive_check(
                 for i in at
             ]
         )  # fmt: skip
-        parameters = np.clip(np.exp(drawn), LOWER, UPPER)
+        parameters = np.clip(np.exp(drawn), *law.box)
     else:
         parameters = law.sample(len(drivers) * draws, rng).reshape(len(drivers), draws, -1)
     gaps = np.asarray(
@@ -420,7 +413,7 @@ def population_content(
     table = {}
     for name, k in zip(names, at, strict=True):
         median, spread = law.median[name], law.spread[name]
-        low, high = LOWER[k], UPPER[k]
+        low, high = law.box.lower[k], law.box.upper[k]
         key = name
         if name == "v0":
             key = "speed_factor" if speed_limit else "v_max"
@@ -434,6 +427,8 @@ def population_content(
             "lower": low,
             "upper": high,
             "identified": float(law.identified[k]),
+            "at_lower": float(law.bound_shares[0, k]),
+            "at_upper": float(law.bound_shares[1, k]),
         }
     return {
         "format": FORMAT,

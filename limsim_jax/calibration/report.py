@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limsim_jax.calibration.cleaning import SHORTEST, Quality, Segment, segments, split_in_time
-from limsim_jax.calibration.fit import LOWER, UPPER, Fit, errors, fit, stack
+from limsim_jax.calibration.fit import Fit, errors, fit, stack
+from limsim_jax.calibration.parameters import Box
 from limsim_jax.calibration.population import estimate, few_drivers, predictive_check
-from limsim_jax.calibration.result import PUBLISHED, UNITS, Calibration, common_limit
+from limsim_jax.calibration.result import PUBLISHED, Calibration, common_limit
 from limsim_jax.calibration.uncertainty import uncertainty
 from limsim_jax.recordings import Recording, RecordingError, Source, as_recording, read_recordings
 from limsim_jax.recordings.checks import TOLERATED
@@ -37,6 +38,7 @@ def calibrate(
     shortest: float = SHORTEST,
     first: float = 0.6,
     starts: int | None = None,
+    bounds: Mapping[str, Sequence[float]] | None = None,
     speed_limit: float | None = None,
     seed: int = 0,
 ) -> Calibration:
@@ -70,6 +72,8 @@ def calibrate(
       shortest: s, shorter segments are left out.
       first: share of every driver's time that is calibrated with; the rest validates.
       starts: descents per driver, see `fit`.
+      bounds: of fitted parameters, as in `{"T": (0.1, 4.0)}`; others keep theirs, which are v0 5 to 45 m/s,
+        T 0.3 to 4 s, s0 0.5 to 8 m, a 0.3 to 4 m/s^2, b 0.5 to 5 m/s^2. The result tells which bounds bind.
       speed_limit: m/s, of the recorded road, to which desired speeds of the population are related; None: the
         limit in the recordings, if they tell one.
       seed: of all that is random.
@@ -82,6 +86,7 @@ def calibrate(
     begin = time.perf_counter()
     if not 0.1 <= first <= 0.9:
         raise ValueError(f"first = {first:g}; a share from 0.1 to 0.9 is needed")
+    Box.of(bounds)  # refuses what is impossible before the data are read
     recordings = read_recordings(data, columns=columns, units=units, length=length, tolerated=tolerated)
     found, quality = gather(recordings, shortest=shortest)
     early, late = split_in_time(found, first)
@@ -94,7 +99,7 @@ def calibrate(
         )
     samples = stack(found)[1].gap.shape[1]
     options: dict[str, Any] = {"objective": objective, "method": method, "starts": starts, "seed": seed}
-    options["samples"] = samples
+    options |= {"bounds": bounds, "samples": samples}
     part = fit(early, model, **options)
     whole = fit(found, model, **options)
     known = uncertainty(whole, found, samples=samples)
@@ -103,7 +108,7 @@ def calibrate(
     if len(part.drivers) >= 3:
         then = estimate(part, early, samples=samples)
         predictive = predictive_check(then, late, known=True, seed=seed)
-        modes = np.clip(np.exp(then.posterior_mean), LOWER, UPPER)
+        modes = np.clip(np.exp(then.posterior_mean), *then.box)
         shrunk = _errors(replace(part, parameters=modes), late, samples)
     everywhere = _errors(whole, found)
     return Calibration(
@@ -179,4 +184,4 @@ def _of_others(whole: Fit) -> Floats:
     return parameters
 
 
-__all__ = ["PUBLISHED", "UNITS", "Calibration", "calibrate", "gather"]
+__all__ = ["PUBLISHED", "Calibration", "calibrate", "gather"]

@@ -15,8 +15,15 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from limsim_jax.calibration.cleaning import Quality, Segment
-from limsim_jax.calibration.fit import PARAMETERS, Fit, model_name, rollout, stack
-from limsim_jax.calibration.population import Law, population_content, write_population
+from limsim_jax.calibration.fit import Fit, model_name, rollout, stack
+from limsim_jax.calibration.parameters import MEANING, PARAMETERS, UNITS
+from limsim_jax.calibration.population import (
+    FEW,
+    IDENTIFIED,
+    Law,
+    population_content,
+    write_population,
+)
 from limsim_jax.calibration.uncertainty import Uncertainty
 from limsim_jax.traffic.population_file import population_of
 from limsim_jax.traffic.vehicles import Population
@@ -24,17 +31,11 @@ from limsim_jax.traffic.vehicles import Population
 PUBLISHED = (0.11, 0.29)
 """Errors of calibrated car-following models, the IDM among them (Kesting, Treiber 2008)."""
 
-UNITS = {"v0": "m/s", "T": "s", "s0": "m", "a": "m/s^2", "b": "m/s^2"}
-
-MEANING = {
-    "v0": "desired speed",
-    "T": "time gap",
-    "s0": "gap at rest",
-    "a": "acceleration",
-    "b": "comfortable braking",
-}
-
 Floats = NDArray[np.float64]
+
+
+_SIDES = {-1: "lower", 0: None, 1: "upper"}
+"""Names of `Uncertainty.side`."""
 
 
 class _Table(NamedTuple):
@@ -101,9 +102,9 @@ class Calibration:
     def drivers(self) -> pa.Table:
         """One row per driver.
 
-        Columns: driver, each parameter with the ends of its 95 % interval (`T`, `T_low`, `T_high`) and
-        whether the data identify it (`T_identified`), and the root mean square errors of gap (m) and speed
-        (m/s) over all its time.
+        Columns: driver, each parameter with the ends of its 95 % interval (`T`, `T_low`, `T_high`), whether
+        the data identify it (`T_identified`) and the bound at which it ends (`T_bound`: "lower", "upper" or
+        null), and the root mean square errors of gap (m) and speed (m/s) over all its time.
         """
         found = self.uncertainty
         columns: dict[str, Any] = {"driver": list(self.fit.drivers)}
@@ -113,6 +114,7 @@ class Calibration:
                 f"{name}_low": found.interval[:, 0, k],
                 f"{name}_high": found.interval[:, 1, k],
                 f"{name}_identified": found.identified[:, k],
+                f"{name}_bound": pa.array([_SIDES[side] for side in found.side[:, k]], pa.string()),
             }
         columns["gap_rmse"], columns["speed_rmse"] = self.everywhere["gap"], self.everywhere["speed"]
         return pa.table(columns)
@@ -130,7 +132,7 @@ class Calibration:
                         "standard_error": float(found.standard_error[i, k]),
                         "interval": found.interval[i, :, k].tolist(),
                         "identified": bool(found.identified[i, k]),
-                        "at_bound": bool(found.at_bound[i, k]),
+                        "at_bound": _SIDES[found.side[i, k]],
                     }
                     for k, p in enumerate(PARAMETERS)
                 },
@@ -156,6 +158,15 @@ class Calibration:
             },
             "published_band": list(PUBLISHED),
             "collisions": self.collisions,
+            "bounds": {
+                p: {
+                    "lower": self.fit.box.lower[k],
+                    "upper": self.fit.box.upper[k],
+                    "at_lower": float(found.bound_shares[0, k]),
+                    "at_upper": float(found.bound_shares[1, k]),
+                }
+                for k, p in enumerate(PARAMETERS)
+            },
             "drivers": drivers,
             "population": {
                 "median": law.median,
@@ -183,21 +194,24 @@ class Calibration:
 
     def _parameters(self) -> _Table:
         found, values = self.uncertainty, self.fit.parameters
+        bounds = [f"{low:g} to {high:g}" for low, high in zip(*self.fit.box, strict=True)]
         rows = []
         if len(values) == 1:
             for k, name in enumerate(PARAMETERS):
                 low, high = found.interval[0, :, k]
                 told = "yes" if found.identified[0, k] else "no"
-                cells = [f"{values[0, k]:.2f}", f"[{low:.2f}, {high:.2f}]", told]
+                cells = [f"{values[0, k]:.2f}", f"[{low:.2f}, {high:.2f}]", told, bounds[k]]
                 rows.append([f"{name}, {UNITS[name]}", *cells, MEANING[name]])
-            return _Table(["parameter", "value", "95 % interval", "identified", ""], rows)
+            return _Table(["parameter", "value", "95 % interval", "identified", "bounds", ""], rows)
         for k, name in enumerate(PARAMETERS):
             low, middle, high = np.percentile(values[:, k], [25, 50, 75])
             relative = float(np.median(found.standard_error[:, k] / values[:, k]))
             cells = [f"{middle:.2f}", f"{low:.2f} to {high:.2f}", f"{relative:.0%}"]
-            cells += [f"{found.identified[:, k].mean():.0%}", f"{found.at_bound[:, k].mean():.0%}"]
+            lower, upper = found.bound_shares[:, k]
+            cells += [f"{found.identified[:, k].mean():.0%}", bounds[k], f"{lower:.0%}, {upper:.0%}"]
             rows.append([f"{name}, {UNITS[name]}", *cells, MEANING[name]])
-        head = ["parameter", "median driver", "quartiles", "standard error", "identified", "at bound", ""]
+        head = ["parameter", "median driver", "quartiles", "standard error", "identified"]
+        head += ["bounds", "at lower, upper", ""]
         return _Table(head, rows)
 
     def _errors(self) -> _Table:
@@ -205,7 +219,7 @@ class Calibration:
             ("calibration, first part of the time", self.calibrated),
             ("validation, rest of the time", self.validated),
         ]
-        if len(self.fit.drivers) >= 3:
+        if len(self.fit.drivers) >= FEW:
             parts.append(("validation, drawn to the population", self.shrunk))
         if len(self.fit.drivers) >= 2:
             parts.append(("median driver of the others", self.of_others))
@@ -223,8 +237,18 @@ class Calibration:
         yield f"published errors of the gap: {PUBLISHED[0]:.0%} to {PUBLISHED[1]:.0%}"
         if self.collisions:
             yield f"fitted followers that run into their leaders: {self.collisions}"
+        yield from self._binding()
         law = self.law
-        if len(self.fit.drivers) >= 3:
+        if (count := len(self.fit.drivers)) < FEW:
+            known = zip(PARAMETERS, law.identified, strict=True)
+            told = ", ".join(name for name, share in known if share > IDENTIFIED)
+            like = "copies of this driver" if count == 1 else "spread like these two"
+            yield f"population of {count} driver{'s' if count > 1 else ''}: " + (
+                f"cars are {like} in {told}; other parameters keep their defaults"
+                if told
+                else "none, for the data tell no parameter"
+            )
+        if count >= FEW:
             values = ", ".join(
                 f"{name} {law.median[name]:.2f} x/ {np.exp(law.spread[name]):.2f}" for name in PARAMETERS
             )
@@ -233,6 +257,23 @@ class Calibration:
                 f"residual acceleration: {law.residual.sigma:.2f} m/s^2, {law.residual.tau:.1f} s; "
                 f"predictions of the rest of the time hold {self.predictive['inside_50']:.0%} and "
                 f"{self.predictive['inside_90']:.0%} of gaps within their 50 and 90 %"
+            )
+
+    def _binding(self) -> Iterator[str]:
+        """Which bounds bind, and for how many of the drivers."""
+        shares, box = self.uncertainty.bound_shares, self.fit.box
+        found = [
+            f"{name} at {box[end][k]:g} {UNITS[name]}"
+            + (f" for {shares[end, k]:.0%}" if len(self.fit.drivers) > 1 else "")
+            for k, name in enumerate(PARAMETERS)
+            for end in (0, 1)
+            if shares[end, k] > 0
+        ]
+        if found:
+            of = " of the drivers" if len(self.fit.drivers) > 1 else ""
+            yield (
+                f"bounds that bind: {', '.join(found)}{of}; wider ones (bounds, --bounds) may fit better, or "
+                "the data do not tell the parameter"
             )
 
     def _title(self) -> str:
@@ -334,4 +375,4 @@ def common_limit(limits: Sequence[float], told: float | None) -> float | None:
     return known.pop() if len(known) == 1 and np.isfinite(next(iter(known))) else None
 
 
-__all__ = ["MEANING", "PUBLISHED", "UNITS", "Calibration", "common_limit"]
+__all__ = ["PUBLISHED", "Calibration", "common_limit"]

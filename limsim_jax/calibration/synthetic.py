@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limsim_jax.calibration.cleaning import Segment
-from limsim_jax.calibration.fit import PARAMETERS, Data, rollout
+from limsim_jax.calibration.fit import Data, rollout
+from limsim_jax.calibration.parameters import PARAMETERS
 from limsim_jax.traffic.car_following import IDM, CarFollowing
 
 TYPICAL = (16.0, 1.2, 2.2, 1.3, 2.0)

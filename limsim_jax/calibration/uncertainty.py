@@ -27,18 +27,8 @@ from scipy.signal import lfilter
 from scipy.stats import t as student
 
 from limsim_jax.calibration.cleaning import Segment
-from limsim_jax.calibration.fit import (
-    LOWER,
-    PARAMETERS,
-    UPPER,
-    Data,
-    Fit,
-    Problem,
-    residuals,
-    rollout,
-    stack,
-    unboxed,
-)
+from limsim_jax.calibration.fit import Data, Fit, Problem, residuals, rollout, stack
+from limsim_jax.calibration.parameters import PARAMETERS
 
 IDENTIFIED = 2.0
 """A parameter counts as identified if its 95 % interval reaches at most from p / 2 to 2 p."""
@@ -46,8 +36,6 @@ IDENTIFIED = 2.0
 MEMORY = 5.0
 """s, longest correlation time of residuals; as long as found by Zhang, Sun (2024, arXiv 2210.03571)."""
 
-_PRIOR = np.log(np.divide(UPPER, LOWER)) / 4
-_AT_BOUND = 1e-3  # of the width of the box
 _NO_INFORMATION = 1e-9  # of the largest eigenvalue
 _DEGREES = 4.0  # of freedom, at least
 
@@ -62,12 +50,22 @@ class Uncertainty:
     standard_error: Floats  # [D P], in units of the parameters
     interval: Floats  # [D 2 P], 95 %, within the box
     identified: NDArray[np.bool_]  # [D P]
-    at_bound: NDArray[np.bool_]  # [D P], estimates at the end of the box
+    side: NDArray[np.int64]  # [D P], -1 and 1: the estimate is at its lower and upper bound; otherwise 0
     correlation: Floats  # [D P P], of estimates of log-parameters
     information: Floats  # [D P P], of the data alone: inverse covariance of log-parameters
     condition: Floats  # [D], of H
     sigma: Floats  # [D], standard deviation of the residuals
     rho: Floats  # [D], their correlation from one sample to the next
+
+    @property
+    def at_bound(self) -> NDArray[np.bool_]:
+        """Estimates at a bound, `[D P]`."""
+        return self.side != 0
+
+    @property
+    def bound_shares(self) -> Floats:
+        """Shares of the drivers at lower and upper bounds, `[2 P]`."""
+        return np.stack([(self.side == end).mean(axis=0) for end in (-1, 1)])
 
 
 def uncertainty(fit: Fit, segments: Sequence[Segment], *, samples: int = 0) -> Uncertainty:
@@ -87,27 +85,26 @@ def uncertainty(fit: Fit, segments: Sequence[Segment], *, samples: int = 0) -> U
     # Nearly singular matrices: double precision for the derivatives.
     with jax.enable_x64(True):
         wide = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), data)
-        problem = Problem(fit.model, fit.objective, dt)
-        r, jacobian = _sensitivity(problem, jnp.asarray(fit.parameters), wide)
+        r, jacobian = _sensitivity(fit.problem(dt), jnp.asarray(fit.parameters), wide)
         r, jacobian = np.asarray(r), np.asarray(jacobian)
     counts, starts = np.asarray(data.weight) > 0, np.asarray(data.start) > 0
     rows = [
         _one(r[i], jacobian[i], counts[i], starts[i], dt) for i in range(len(drivers))
     ]  # fmt: skip
     information, condition, sigma, rho, degrees = (np.stack([row[k] for row in rows]) for k in range(5))
-    covariance = np.linalg.inv(information + np.diag(1 / _PRIOR**2))
+    low, high = np.log(fit.box)
+    covariance = np.linalg.inv(information + np.diag((4 / (high - low)) ** 2))
     log_error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    u = unboxed(fit.parameters)
-    at_bound = (u < _AT_BOUND) | (u > 1 - _AT_BOUND)
+    side = fit.box.side(fit.parameters)
     reach = np.exp(student.ppf(0.975, degrees)[:, None] * log_error)
     interval = np.stack([fit.parameters / reach, fit.parameters * reach], axis=1)
     correlation = covariance / (log_error[:, :, None] * log_error[:, None])
     return Uncertainty(
         drivers=drivers,
         standard_error=fit.parameters * log_error,
-        interval=np.clip(interval, LOWER, UPPER),
-        identified=(reach <= IDENTIFIED) & ~at_bound,
-        at_bound=at_bound,
+        interval=np.clip(interval, *fit.box),
+        identified=(reach <= IDENTIFIED) & (side == 0),
+        side=side,
         correlation=correlation,
         information=information,
         condition=condition,

@@ -39,6 +39,14 @@ def calibrate(
     method: Annotated[
         Literal["lm", "lbfgs", "adam"], typer.Option(help="Optimiser; lm: Levenberg-Marquardt.")
     ] = "lm",
+    bounds: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PARAMETER=LOW:HIGH,...",
+            help="Of fitted parameters, such as v0=5:60,T=0.1:4; v0 in m/s, T in s, s0 in m, a and b in "
+            "m/s^2. Default: v0=5:45,T=0.3:4,s0=0.5:8,a=0.3:4,b=0.5:5.",
+        ),
+    ] = None,
     shortest: Annotated[float, typer.Option(help="Leave out what is shorter, s.")] = 20.0,
     tolerated: Annotated[
         float, typer.Option(help="Share of the rows that may have a leader behind or an overlap.")
@@ -78,6 +86,7 @@ def calibrate(
         single_fits,
     )
     from limsim_jax.calibration.fit import MODELS
+    from limsim_jax.calibration.parameters import Box
     from limsim_jax.calibration.population import FEW
     from limsim_jax.calibration.report import calibrate as fit
     from limsim_jax.calibration.report import gather
@@ -88,6 +97,8 @@ def calibrate(
     check_writable(out, json_file)
     if not 10 <= period < float("inf"):
         raise typer.BadParameter(f"{period:g} s; at least 10", param_hint="--period")
+    within = _ranges(bounds, "--bounds")
+    Box.of(within)  # refuses what is impossible before the data are read
     enable_compilation_cache()
     recordings = read_recordings(
         data,
@@ -106,6 +117,7 @@ def calibrate(
         objective=objective,
         method=method,
         shortest=shortest,
+        bounds=within,
         seed=seed,
         speed_limit=speed_limit,
     )
@@ -118,7 +130,13 @@ def calibrate(
             linked,
             gather(recordings, shortest=shortest)[0],
             population=partial(
-                single_fits, model=driven, objective=objective, method=method, starts=None, seed=seed
+                single_fits,
+                model=driven,
+                objective=objective,
+                method=method,
+                starts=None,
+                bounds=within,
+                seed=seed,
             ),
             model=driven,
             speed_limit=speed_limit or SPEED_LIMIT,
@@ -142,6 +160,19 @@ def _pairs(text: str | None, option: str) -> dict[str, str] | None:
         if not (name.strip() and sign and value.strip()):
             raise typer.BadParameter(f"'{name}{sign}{value}'; FIELD=VALUE is expected", param_hint=option)
     return {name.strip(): value.strip() for name, _, value in pairs}
+
+
+def _ranges(text: str | None, option: str) -> dict[str, tuple[float, float]] | None:
+    """Names and ranges of `name=low:high,name=low:high`."""
+    found = {}
+    for name, value in (_pairs(text, option) or {}).items():
+        low, _, high = value.partition(":")
+        try:
+            found[name] = (float(low), float(high))
+        except ValueError:
+            reason = f"'{name}={value}'; PARAMETER=LOW:HIGH is expected, such as T=0.1:4"
+            raise typer.BadParameter(reason, param_hint=option) from None
+    return found or None
 
 
 def train(

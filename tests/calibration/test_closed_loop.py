@@ -23,8 +23,9 @@ from limsim_jax.calibration.closed_loop.distances import (
     wasserstein,
 )
 from limsim_jax.calibration.closed_loop.validation import outside
-from limsim_jax.calibration.fit import MODELS, PARAMETERS, driver, rollout, stack
+from limsim_jax.calibration.fit import MODELS, driver, rollout, stack
 from limsim_jax.calibration.matching import match, scaled, write_scaled
+from limsim_jax.calibration.parameters import PARAMETERS
 from limsim_jax.calibration.population import Law, Residual
 from limsim_jax.calibration.synthetic import TYPICAL, leader_speed
 from limsim_jax.traffic.population_file import read_population
@@ -49,7 +50,8 @@ def law(median, spread):
     return Law(
         mean=np.log(median), covariance=np.diag(np.square(spread)), drivers=("a", "b", "c"),
         posterior_mean=np.zeros((3, count)), posterior_covariance=np.zeros((3, count, count)),
-        identified=np.full(count, 0.8), model=MODEL, objective="gap", residual=Residual(sigma=0.2, tau=1.5),
+        identified=np.full(count, 0.8), bound_shares=np.zeros((2, count)), model=MODEL, objective="gap",
+        residual=Residual(sigma=0.2, tau=1.5),
     )  # fmt: skip
 
 

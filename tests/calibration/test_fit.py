@@ -1,20 +1,20 @@
 """Fits of car-following models: rollouts, gradients, recovery of known drivers, other optimisers."""
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from differential_evolution import fit_by_evolution
-from paths import SHARED, needs_shared
+from paths import REPO, SHARED, needs_shared
 from scipy.optimize import differential_evolution
 
+from limsim_jax.calibration import calibrate
 from limsim_jax.calibration.cleaning import Segment, segments
 from limsim_jax.calibration.fit import (
-    LOWER,
     MODELS,
     OBJECTIVES,
-    PARAMETERS,
-    UPPER,
     Data,
     Problem,
     _normal_equations,
@@ -25,8 +25,10 @@ from limsim_jax.calibration.fit import (
     rollout,
     stack,
 )
+from limsim_jax.calibration.parameters import BOUNDS, BOX, PARAMETERS, UNITS
 from limsim_jax.calibration.synthetic import TYPICAL, drivers, follow
 from limsim_jax.calibration.uncertainty import uncertainty
+from limsim_jax.cli.fitting import calibrate as cli_calibrate
 from limsim_jax.recordings import read_recording
 
 pytestmark = pytest.mark.engine
@@ -200,7 +202,7 @@ def test_gradients_find_what_differential_evolution_finds(known):
         same = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (p.shape[0], x.shape[-1])), data)
         return errors(MODELS["idm"], p, same, dt)["mixed"]
 
-    bounds = list(zip(LOWER, UPPER, strict=True))
+    bounds = list(zip(*BOX, strict=True))
     peer = differential_evolution(
         cost, bounds, maxiter=80, vectorized=True, updating="deferred", polish=False, rng=1
     )
@@ -228,6 +230,54 @@ def test_a_fit_does_not_depend_on_the_other_drivers(known):
     alone = fit(recorded[7:10], objective="gap")
     np.testing.assert_allclose(alone.error, found.error[7:10], rtol=1e-3)
     np.testing.assert_allclose(alone.parameters, found.parameters[7:10], rtol=2e-2)
+
+
+def test_a_bound_that_binds_is_told_and_wider_ones_find_the_driver():
+    """Two drivers with time gaps beyond the default box, one within."""
+    rng = np.random.default_rng(8)
+    truth = np.tile(TYPICAL, (3, 1))
+    truth[:2, 1] = 5.0
+    recorded = follow(truth, rng, noise=0.05)
+    usual, wide = (fit(recorded, objective="gap", bounds=b) for b in (None, {"T": (0.2, 8.0)}))
+    sure = uncertainty(usual, recorded)
+    assert sure.side[:, 1].tolist() == [1, 1, 0]
+    assert sure.bound_shares[:, 1] == pytest.approx([0, 2 / 3])
+    assert usual["T"][:2] == pytest.approx(BOUNDS["T"][1])
+    assert not sure.identified[:2, 1].any()
+    np.testing.assert_allclose(wide["T"], truth[:, 1], rtol=0.02)
+    assert (wide.error[:2] < 0.2 * usual.error[:2]).all()
+    again = uncertainty(wide, recorded)
+    assert not again.at_bound[:, 1].any() and again.identified[:, 1].all()
+    assert (again.interval[:2, 1, 1] > BOUNDS["T"][1]).all()  # not cut at the default box
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        ({"tau": (1, 2)}, "bounds: no parameter 'tau'; known are v0, T, s0, a, b"),
+        ({"T": (3.0, 0.3)}, "bounds: T within (3.0, 0.3); finite numbers of s with 0 < low < high"),
+        ({"T": (1.0, 1.0)}, "bounds: T within (1.0, 1.0)"),
+        ({"b": (-1.0, 2.0)}, "bounds: b within (-1.0, 2.0); finite numbers of m/s^2"),
+        ({"a": (0, 2)}, "bounds: a within (0, 2)"),
+        ({"s0": (1.0, np.inf)}, "bounds: s0 within (1.0, inf)"),
+        ({"s0": (np.nan, 2.0)}, "bounds: s0 within (nan, 2.0)"),
+        ({"v0": (5, 30, 45)}, "bounds: v0 within (5, 30, 45)"),
+    ],
+)
+def test_bounds_that_cannot_be_are_refused(bounds, message):
+    with pytest.raises(ValueError) as caught:
+        fit([], bounds=bounds)  # before anything is looked at
+    assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="bounds"):
+        calibrate("none.csv", bounds=bounds)
+
+
+def test_default_bounds_are_documented():
+    text = (REPO / "docs" / "guides" / "calibrate.md").read_text() + inspect.getsource(cli_calibrate)
+    for name, (low, high) in BOUNDS.items():
+        assert f"{name}={low:g}:{high:g}" in text
+        assert f"| `{name}` | {UNITS[name].replace('^2', '²')} | {low:g} to {high:g} |" in text
+        assert f"{name} {low:g} to {high:g}" in " ".join((calibrate.__doc__ or "").split())
 
 
 def test_arguments_are_checked(known):

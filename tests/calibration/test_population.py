@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from paths import SHARED, needs_shared
 
-from limsim_jax.calibration.fit import LOWER, MODELS, PARAMETERS, UPPER, Data, Fit, fit, stack
+from limsim_jax.calibration.fit import MODELS, Data, Fit, fit, stack
+from limsim_jax.calibration.parameters import BOX, PARAMETERS
 from limsim_jax.calibration.population import (
     Law,
     Residual,
@@ -55,6 +56,7 @@ def law(residual=None):
         posterior_mean=rng.multivariate_normal(np.log(TYPICAL), COVARIANCE, 3),
         posterior_covariance=np.tile(COVARIANCE / 100, (3, 1, 1)),
         identified=np.array([0.9, 0.8, 0.7, 0.6, 0.2]),
+        bound_shares=np.zeros((2, 5)),
         model=MODELS["idm"],
         objective="gap",
         residual=residual or Residual(sigma=0.2, tau=1.5),
@@ -75,13 +77,13 @@ def test_a_known_population_is_found(known):
 def test_expectation_maximisation_draws_unsure_drivers_to_the_others():
     """Against the closed form of one Gaussian unknown per driver: 50 sure of 2.0, one unsure of 6.0."""
     size, count = 5, 51
-    centre = (np.log(LOWER) + np.log(UPPER)) / 2
+    centre = np.log(BOX).mean(axis=0)
     estimates = np.tile(centre, (count, 1))
     estimates[:, 2] += np.r_[np.random.default_rng(0).normal(0, 0.3, count - 1), np.log(3.0)]
     precision = np.r_[np.full(count - 1, 1e6), 1.0]
     information = precision[:, None, None] * np.eye(size)
     pull = np.einsum("dij,dj->di", information, estimates)
-    mean, covariance, posterior, spread = _expectation_maximisation(information, pull)
+    mean, covariance, posterior, spread = _expectation_maximisation(information, pull, BOX)
     np.testing.assert_allclose(posterior[:-1], estimates[:-1], atol=1e-3)
     weight = 1 / (1 + 1 / covariance[2, 2])
     expected = weight * estimates[-1, 2] + (1 - weight) * mean[2]

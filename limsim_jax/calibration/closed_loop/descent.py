@@ -23,7 +23,7 @@ from limsim_jax.calibration.closed_loop.distances import (
     headway,
     simulate_samples,
 )
-from limsim_jax.calibration.fit import LOWER, PARAMETERS, UPPER
+from limsim_jax.calibration.parameters import BOX, PARAMETERS, Box
 from limsim_jax.calibration.population import IDENTIFIED, Law
 from limsim_jax.traffic.car_following import CarFollowing
 from limsim_jax.traffic.vehicles import CUT, default_population, sample_vehicles
@@ -48,10 +48,10 @@ def scores(draws: int, drivers: int, seed: int) -> Float[Array, "K D P"]:
 
 
 def drawn(
-    mean: Float[Array, " P"], root: Float[Array, "P P"], z: Float[Array, "K D P"]
+    mean: Float[Array, " P"], root: Float[Array, "P P"], z: Float[Array, "K D P"], box: Box = BOX
 ) -> Float[Array, "K D P"]:
-    """Drivers with these scores: log-normal parameters within the box of `fit`."""
-    low, high, mean = (jnp.broadcast_to(jnp.asarray(x, z.dtype), z.shape) for x in (LOWER, UPPER, mean))
+    """Drivers with these scores: log-normal parameters within the box."""
+    low, high, mean = (jnp.broadcast_to(jnp.asarray(x, z.dtype), z.shape) for x in (*box, mean))
     return jnp.clip(jnp.exp(mean + z @ root.T), low, high)
 
 
@@ -71,7 +71,7 @@ class _Point(NamedTuple):
     wider: Array  # [P], logarithm of the factor on the spreads
 
 
-@partial(jax.jit, static_argnames=("model", "dt", "points", "iterations"))
+@partial(jax.jit, static_argnames=("model", "dt", "points", "iterations", "box"))
 def descend(
     model: CarFollowing,
     mean: Array,
@@ -83,11 +83,12 @@ def descend(
     dt: float,
     points: int,
     iterations: int,
+    box: Box,
 ) -> tuple[_Point, Array]:
     """Adam from the start; the best point and the losses."""
 
     def loss(point: _Point) -> Array:
-        parameters = drawn(*moved(mean, root, point), z)
+        parameters = drawn(*moved(mean, root, point), z, box)
         gap, v = simulate_samples(model, parameters, chains, recorded, dt)
         found = distances(recorded, gap, v, points)
         tame = jnp.sum(point.shift**2 / jnp.sum(root * root, axis=-1)) + jnp.sum(point.wider**2)

@@ -37,7 +37,8 @@ from limsim_jax.calibration.closed_loop.distances import (
     samples,
     simulate_samples,
 )
-from limsim_jax.calibration.fit import PARAMETERS, fit, model_name
+from limsim_jax.calibration.fit import fit, model_name
+from limsim_jax.calibration.parameters import PARAMETERS
 from limsim_jax.calibration.population import Law, estimate, write_population
 from limsim_jax.traffic.car_following import ACC, IDM, CarFollowing
 
@@ -260,7 +261,7 @@ def calibrate_closed_loop(
         for mean, root in start_populations(start, *usual):
             point, losses = descend(
                 model, mean, root, z_fit, chains, recorded, scale, linked.dt,
-                int(recorded.point.max()) + 1, iterations,
+                int(recorded.point.max()) + 1, iterations, start.box,
             )  # fmt: skip
             ends.append((float(jnp.min(losses)), moved(mean, root, point), losses))
         _, (mean, root), losses = min(ends, key=lambda end: end[0])
@@ -275,7 +276,7 @@ def calibrate_closed_loop(
         drivers = {"default": default}
         for name, law in zip(("start", "closed_loop"), laws, strict=True):
             mean, root = (jnp.asarray(x, jnp.float32) for x in (law.mean, np.linalg.cholesky(law.covariance)))
-            drivers[name] = drawn(mean, root, z)
+            drivers[name] = drawn(mean, root, z, law.box)
         return {
             name: jax.device_get(simulate_samples(model, p, chains, recorded, linked.dt))
             for name, p in drivers.items()
