@@ -12,15 +12,18 @@ defects, and around lane changes. What is cut and why stands in the `Quality` of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from limsim_jax.recordings import Recording, RecordingError
+from limsim_jax.recordings.checks import check_rows, impossible
+from limsim_jax.recordings.recording import FASTEST
 
 SMOOTHING = 1.0
 """s, width of the window."""
@@ -42,7 +45,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """A follower behind one leader, `T` samples in steps of `dt`."""
+    """A follower behind one leader, `T` samples in steps of `dt`.
+
+    Raises:
+      ValueError: series of unequal length, or a value that cannot be; one line that names it.
+    """
 
     driver: str  # unique over the files
     leader: str
@@ -55,6 +62,28 @@ class Segment:
     v: Floats  # m/s
     v_lead: Floats  # m/s
     length_lead: float = 4.5  # m
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+
+        def refuse(what: str) -> NoReturn:
+            raise ValueError(f"segment of driver '{self.driver}': {what} is expected")
+
+        for name in ("dt", "length_lead"):
+            if not 0 < getattr(self, name) < math.inf:
+                refuse(f"{name} = {getattr(self, name):g}; a finite number above 0")
+        for name in ("gap", "v", "v_lead"):
+            values = np.asarray(getattr(self, name), float)
+            if values.shape != (np.size(self.gap),):
+                refuse(f"{name} has shape {values.shape}, gap {np.shape(self.gap)}; one axis of equal length")
+            if name == "gap":
+                good, usual = (values > 0) & (values < math.inf), "a finite gap above 0 m"
+            else:
+                good, usual = (values >= 0) & (values <= FASTEST), f"a speed from 0 to {FASTEST:g} m/s"
+            if not good.all():
+                k = int(np.argmin(good))
+                refuse(f"{name}[{k}] = {values[k]:g}; {usual}")
+            object.__setattr__(self, name, values)
 
     def __len__(self) -> int:
         return len(self.gap)
@@ -112,8 +141,9 @@ def segments(
       margins: drop what is next to changes of the leader or the lane.
 
     Raises:
-      RecordingError: nothing is left.
+      RecordingError: a row of a follower is broken, or nothing is left.
     """
+    check_rows(recording)
     r = recording
     following = r.leader >= 0
     quality = Quality(
@@ -135,7 +165,11 @@ def segments(
         if (r.time[end - 1] - r.time[begin]) < shortest - 1.5 * r.dt:
             _drop(quality, f"shorter than {shortest:g} s", (end - begin) * r.dt)
             continue
-        segment, off, moved = _segment(r, rows, dt, smoothing)
+        made = _segment(r, rows, dt, smoothing)
+        if made is None:
+            _drop(quality, "bodies that touch once smoothed", (end - begin) * r.dt)
+            continue
+        segment, off, moved = made
         if np.mean(segment.v < 0.1) > STANDING_SHARE:
             _drop(quality, "the follower hardly moves", (end - begin) * r.dt)
             continue
@@ -183,16 +217,18 @@ def _bad(r: Recording, quality: Quality, margins: bool) -> NDArray[np.bool_]:
     none = r.leader < 0
     overlap = ~none & ~(r.gap > 0)
     _drop(quality, "overlapping bodies or a leader behind", float(overlap.sum() * r.dt))
+    speeds = ~none & ~overlap & (impossible(r, "v") | impossible(r, "v_lead"))
+    _drop(quality, "impossible speeds", float(speeds.sum() * r.dt))
     new = np.diff(r.vehicle, prepend=-1) != 0
     # Around changes of the own lane, and where the leader has changed or time is missing.
     changes = {"a lane change": (LANE_CHANGE, (np.diff(r.lane, prepend=r.lane[:1]) != 0) & ~new)}
     leader = np.diff(r.leader, prepend=r.leader[:1]) != 0
     changes["a change of the leader"] = (LEADER_CHANGE, leader & ~new)
-    bad = none | overlap
+    bad = none | overlap | speeds
     if not margins:
         changes.clear()
     # With the defects of a pair goes what is next to them.
-    changes["a defect"] = (LEADER_CHANGE, overlap)
+    changes["a defect"] = (LEADER_CHANGE, overlap | speeds)
     for reason, (margin, at) in changes.items():
         near = _around(r, at, margin) & ~bad
         _drop(quality, f"near {reason}", float(near.sum() * r.dt))
@@ -235,8 +271,8 @@ def _stretches(r: Recording, bad: NDArray[np.bool_]) -> tuple[NDArray[np.int64],
 
 def _segment(
     r: Recording, rows: slice, dt: float, smoothing: float
-) -> tuple[Segment, tuple[Floats, Floats], Floats]:
-    """A segment, and its differences from recorded speeds and gaps."""
+) -> tuple[Segment, tuple[Floats, Floats], Floats] | None:
+    """A segment, and its differences from recorded speeds and gaps; None if bodies touch."""
     time = r.time[rows]
     x_lead, v_lead = _motion(r.x_lead[rows], r.dt, smoothing)
     x, v = _motion(r.x[rows], r.dt, smoothing)
@@ -247,6 +283,8 @@ def _segment(
         grid = np.arange(time[0], time[-1] + 1e-6, dt)
         v, v_lead, first = np.interp(grid, time, v), np.interp(grid, time, v_lead), gap[0]
         gap = first + _integral(v_lead - v, dt)
+    if gap.min() <= 0:
+        return None
     where = f"{r.names[r.vehicle[rows.start]]}"
     return (
         Segment(

@@ -48,6 +48,7 @@ FLOOR = 1.0
 """m, least gap in objectives that divide by it or take its logarithm."""
 
 _FIXED = {"delta": 4.0, "b_max": 9.0, "coolness": 0.99}
+_BROKEN = 1e9  # cost of a rollout that is not finite
 _REACH = 7.0  # of theta: within 0.1 % of the bounds
 _PAD = 128  # numbers of samples are multiples, so that few shapes are compiled
 
@@ -76,10 +77,15 @@ def stack(segments: Sequence[Segment], samples: int = 0) -> tuple[tuple[str, ...
       samples: at least so long; equal shapes share compiled programs.
 
     Raises:
-      ValueError: there are no segments, or their time steps differ.
+      ValueError: there are no segments, one has a single sample, or their time steps differ.
     """
     if not segments:
         raise ValueError("no segments; at least one recorded follower is needed")
+    for part in segments:
+        if len(part) < 2:
+            raise ValueError(
+                f"segment of driver '{part.driver}': {len(part)} samples; 2 or more are expected"
+            )
     drivers = by_driver(segments)
     steps = {round(segment.dt, 6) for segment in segments}
     if len(steps) > 1:
@@ -244,7 +250,7 @@ def cost(problem: Problem, u: Array, data: Data, prior: Prior | None = None) -> 
 
 
 def _finite(cost: Array) -> Array:
-    return jnp.where(jnp.isfinite(cost), cost, 1e9)
+    return jnp.where(jnp.isfinite(cost), cost, _BROKEN)
 
 
 def _normal_equations(
@@ -260,7 +266,7 @@ def _normal_equations(
     jacobian, r = found
     good = jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(r))
     jacobian, r = jnp.where(good, jacobian, 0), jnp.where(good, r, 0)
-    return jnp.where(good, jnp.sum(r * r), 1e9), jacobian.T @ r, jacobian.T @ jacobian
+    return jnp.where(good, jnp.sum(r * r), _BROKEN), jacobian.T @ r, jacobian.T @ jacobian
 
 
 _DAMPINGS = (0.1, 1.0, 16.0)
@@ -330,7 +336,7 @@ def _levenberg_marquardt(
         return (count < iterations) & jnp.any(now.still < 3)
 
     zero = jnp.zeros(u.shape[:2], u.dtype)
-    start = _Descent(u, zero + 1e9, zero + 0.1, zero)
+    start = _Descent(u, zero + _BROKEN, zero + 0.1, zero)
     end = jax.lax.while_loop(goes_on, step, (jnp.zeros((), jnp.int32), start))[1]
     return end.u, end.cost
 
@@ -454,7 +460,8 @@ def fit(
       samples: see `stack`.
 
     Raises:
-      ValueError: no segments, an unknown objective or method, or impossible bounds.
+      ValueError: no segments, an unknown objective or method, impossible bounds, or a model that gives no
+        finite gaps.
     """
     for what, value, known in (
         ("objective", objective, OBJECTIVES),
@@ -468,6 +475,9 @@ def fit(
     u, costs = solve(Problem(model, objective, dt, box), data, method, starts, iterations, seed)
     best = np.argmin(costs, axis=-1)
     rows = np.arange(len(drivers))
+    for name, least in zip(drivers, costs[rows, best], strict=True):
+        if least > _BROKEN / 2:
+            raise ValueError(f"driver '{name}': {model_name(model)} gives no finite gaps for any parameters")
     return Fit(
         model=model,
         objective=objective,

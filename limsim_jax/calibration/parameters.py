@@ -80,7 +80,18 @@ class Box(NamedTuple):
         return np.where(u < _AT_BOUND, -1, np.where(u > 1 - _AT_BOUND, 1, 0))
 
 
+def check_positive(**values: float | None) -> None:
+    """Refuse arguments that are neither None nor finite and above 0.
+
+    Raises:
+      ValueError: one line that names the first of them.
+    """
+    for name, value in values.items():
+        if value is not None and not 0 < value < math.inf:
+            raise ValueError(f"{name} = {value:g}; a finite number above 0 is expected")
+
+
 BOX = Box.of()
 """That of `BOUNDS`."""
 
-__all__ = ["BOUNDS", "BOX", "MEANING", "PARAMETERS", "UNITS", "Box"]
+__all__ = ["BOUNDS", "BOX", "MEANING", "PARAMETERS", "UNITS", "Box", "check_positive"]

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.calibration.cleaning import Segment
 from limsim_jax.calibration.fit import Data, Fit, Prior, driver, model_name, refine, rollout, stack
-from limsim_jax.calibration.parameters import BOX, PARAMETERS, Box
+from limsim_jax.calibration.parameters import BOX, PARAMETERS, Box, check_positive
 from limsim_jax.calibration.uncertainty import Uncertainty, uncertainty
 from limsim_jax.files import write_whole
 from limsim_jax.traffic.car_following import CarFollowing
@@ -396,8 +396,9 @@ def population_content(
     speeds. Of one or two drivers all parameters are treated like this.
 
     Raises:
-      ValueError: the data of one or two drivers tell no parameter.
+      ValueError: the data of one or two drivers tell no parameter, or the speed limit is impossible.
     """
+    check_positive(speed_limit=speed_limit)
     few = len(law.drivers) < FEW
     names = [
         name

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.calibration.cleaning import SHORTEST, Quality, Segment, segments, split_in_time
 from limsim_jax.calibration.fit import Fit, errors, fit, stack
-from limsim_jax.calibration.parameters import Box
+from limsim_jax.calibration.parameters import Box, check_positive
 from limsim_jax.calibration.population import estimate, few_drivers, predictive_check
 from limsim_jax.calibration.result import PUBLISHED, Calibration, common_limit
 from limsim_jax.calibration.uncertainty import uncertainty
@@ -86,6 +86,7 @@ def calibrate(
     begin = time.perf_counter()
     if not 0.1 <= first <= 0.9:
         raise ValueError(f"first = {first:g}; a share from 0.1 to 0.9 is needed")
+    check_positive(shortest=shortest, starts=starts, speed_limit=speed_limit)
     Box.of(bounds)  # refuses what is impossible before the data are read
     recordings = read_recordings(data, columns=columns, units=units, length=length, tolerated=tolerated)
     found, quality = gather(recordings, shortest=shortest)

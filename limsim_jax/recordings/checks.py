@@ -7,16 +7,21 @@ from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from limsim_jax.recordings.recording import (
     CAR,
     CAR_LENGTHS,
     FASTEST,
     FOOT,
+    ROWS,
     Defect,
     Recording,
     RecordingError,
 )
+
+BACKWARDS = 0.5
+"""m/s, recorded speeds below 0 by at most this are noise of a vehicle at rest."""
 
 TOLERATED = 0.5
 """Share of the rows of followers that may have a leader behind or an overlap: more is a fault of the file."""
@@ -61,6 +66,40 @@ def checked(recording: Recording, tolerated: float = TOLERATED) -> Recording:
     return recording
 
 
+def check_rows(r: Recording) -> None:
+    """Refuse rows of followers that cannot be: what no reader lets through.
+
+    Raises:
+      RecordingError: fields of unequal length, a value that is not finite, or times that do not grow.
+    """
+    for field in ROWS:
+        if (count := len(getattr(r, field))) != len(r):
+            raise RecordingError(
+                f"{r.source}: {field} has {count} rows, time {len(r)}; equally many are expected"
+            )
+    finite = {name: np.isfinite(getattr(r, name)) for name in ("time", "x", "x_lead", "length_lead")}
+    grows = np.diff(r.time, prepend=-np.inf) > 0
+    grows |= np.diff(r.vehicle, prepend=-1) != 0
+    for field, good, expected in (
+        *((name, good, "a finite number") for name, good in finite.items()),
+        ("time", grows, "a time after that of the row before"),
+    ):
+        bad = (r.leader >= 0) & ~good
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise RecordingError(
+                f"{r.source}: {r.row} {r.line[k]}, column {r.columns.get(field, field)}: "
+                f"'{getattr(r, field)[k]:g}'; {expected} is expected"
+            )
+
+
+def impossible(r: Recording, field: str) -> NDArray[np.bool_]:
+    """Rows whose recorded speed no vehicle has; `field` is `v` or `v_lead`."""
+    v = getattr(r, field)
+    recorded = field in r.columns or r.kind != "table"  # others are derived from the positions
+    return ((v < -BACKWARDS) | (v > FASTEST)) & recorded
+
+
 def looks_like_feet(value: float, usual: float = 4.6) -> str:
     """A hint that a length is one in feet; `usual`: m."""
     return " (it looks like feet)" if 0.7 < value * FOOT / usual < 1.4 else ""
@@ -91,7 +130,7 @@ def _check_units(r: Recording) -> None:
                 )
     for position, speed in (("x", "v"), ("x_lead", "v_lead")):
         x, v = getattr(r, position), getattr(r, speed)
-        backwards = v < -0.5
+        backwards = v < -BACKWARDS
         if np.mean(backwards) > 0.01:
             refuse(int(np.argmax(backwards)), speed, f"{v[backwards][0]:.2f} m/s; speeds are not negative")
         fast = float(np.nanquantile(v, 0.99)) if np.isfinite(v).any() else 0.0
@@ -100,7 +139,7 @@ def _check_units(r: Recording) -> None:
             refuse(k, speed, f"{v[k]:.0f} m/s; at most {FASTEST:.0f} m/s are expected")
         if r.kind == "OpenACC" and position == "x_lead":
             continue  # these positions are integrals of the speeds
-        step = np.diff(r.time)
+        step, odd = np.diff(r.time), impossible(r, speed)
         near = (
             (np.diff(r.vehicle) == 0)
             & (step < 1.5 * r.dt)
@@ -109,7 +148,7 @@ def _check_units(r: Recording) -> None:
         )
         moved, driven = np.diff(x), 0.5 * (v[1:] + v[:-1]) * step
         # Positions against speeds, over rows where something moves.
-        moving = near & (driven > 0.5 * r.dt) & np.isfinite(moved)
+        moving = near & (driven > 0.5 * r.dt) & np.isfinite(moved) & ~odd[1:] & ~odd[:-1]
         if moving.sum() >= 20:
             ratio = float(np.sum(moved[moving]) / np.sum(driven[moving]))
             if not 0.8 <= ratio <= 1.25:
@@ -125,7 +164,7 @@ def _check_units(r: Recording) -> None:
 
 
 def _defects(r: Recording) -> Iterator[Defect]:
-    """Time that is missing, leaders behind, bodies that overlap."""
+    """Time that is missing, impossible speeds, leaders behind, bodies that overlap."""
 
     def column(field: str) -> str:
         return r.columns.get(field, field)
@@ -143,6 +182,17 @@ def _defects(r: Recording) -> Iterator[Defect]:
             f"of vehicle {r.names[r.vehicle[k]]}; steps of {r.dt:g} s are expected",
         )
     following = r.leader >= 0
+    for field in ("v", "v_lead"):
+        v = getattr(r, field)
+        for k in np.flatnonzero(following & impossible(r, field)):
+            yield Defect(
+                "speed",
+                r.names[r.vehicle[k]],
+                int(r.line[k]),
+                1,
+                f"{r.row} {r.line[k]}, column {column(field)}: {v[k]:g} m/s; 0 to {FASTEST:g} m/s "
+                "are expected",
+            )
     behind = following & (r.x_lead <= r.x)
     overlap = following & ~behind & (r.gap <= 0)
     for bad, kind in ((behind, "behind"), (overlap, "overlap")):
@@ -158,6 +208,7 @@ def _defects(r: Recording) -> Iterator[Defect]:
                 else f"{name} overlaps its leader {leader} by {-r.gap[k:end].min():.1f} m; a gap above 0"
             )
             field = "x_lead" if kind == "behind" and not gapless else "x"
+            field = "gap" if "gap" in r.columns else field  # of a table that tells gaps
             yield Defect(
                 "spacing" if gapless else kind,
                 name,
@@ -167,4 +218,4 @@ def _defects(r: Recording) -> Iterator[Defect]:
             )
 
 
-__all__ = ["TOLERATED", "checked", "looks_like_feet"]
+__all__ = ["BACKWARDS", "TOLERATED", "check_rows", "checked", "impossible", "looks_like_feet"]

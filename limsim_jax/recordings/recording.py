@@ -49,7 +49,7 @@ class RecordingError(ValueError):
 class Defect:
     """A flaw of a recording at one place."""
 
-    kind: str  # "time", "overlap", "behind", "spacing"
+    kind: str  # "time", "speed", "overlap", "behind", "spacing"
     vehicle: str
     line: int  # of the file, the header being line 1
     rows: int  # that it concerns

@@ -1,6 +1,7 @@
 """Fits of car-following models: rollouts, gradients, recovery of known drivers, other optimisers."""
 
 import inspect
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ from limsim_jax.calibration.synthetic import TYPICAL, drivers, follow
 from limsim_jax.calibration.uncertainty import uncertainty
 from limsim_jax.cli.fitting import calibrate as cli_calibrate
 from limsim_jax.recordings import read_recording
+from limsim_jax.traffic.car_following import IDM
 
 pytestmark = pytest.mark.engine
 
@@ -51,6 +53,21 @@ def segment(gap, v, v_lead, driver="one", dt=DT):
         driver=driver, leader="leader", source="made up", line=1, dt=dt, time=0.0, vehicle_class=0,
         gap=gap, v=v, v_lead=v_lead,
     )  # fmt: skip
+
+
+def put(value, at, odd):
+    """50 equal values but one."""
+    values = np.full(50, value)
+    values[at] = odd
+    return values
+
+
+@dataclass(frozen=True)
+class Lost(IDM):
+    """A model that does not know."""
+
+    def __call__(self, *args, **kwargs):
+        return super().__call__(*args, **kwargs) * jnp.nan
 
 
 def idm_by_hand(parameters, gap, v, v_lead):
@@ -280,8 +297,38 @@ def test_default_bounds_are_documented():
         assert f"{name} {low:g} to {high:g}" in " ".join((calibrate.__doc__ or "").split())
 
 
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"gap": put(10.0, 7, np.nan)}, "gap[7] = nan; a finite gap above 0 m is expected"),
+        ({"gap": put(10.0, 7, np.inf)}, "gap[7] = inf; a finite gap above 0 m"),
+        ({"gap": put(10.0, 7, -2.0)}, "gap[7] = -2; a finite gap above 0 m"),
+        ({"v": put(3.0, 9, -1.0)}, "v[9] = -1; a speed from 0 to 70 m/s is expected"),
+        ({"v": put(3.0, 9, np.nan)}, "v[9] = nan; a speed"),
+        ({"v_lead": put(3.0, 0, 1e9)}, "v_lead[0] = 1e+09; a speed"),
+        ({"v": np.full(49, 3.0)}, "v has shape (49,), gap (50,); one axis of equal length"),
+        ({"dt": np.nan}, "dt = nan; a finite number above 0"),
+        ({"dt": -0.1}, "dt = -0.1; a finite number above 0"),
+        ({"length_lead": 0.0}, "length_lead = 0; a finite number above 0"),
+    ],
+)
+def test_a_segment_that_cannot_be_is_refused(changed, message):
+    """In one line that names driver, series, sample and value."""
+    with pytest.raises(ValueError) as caught:
+        replace(segment(10.0, 3.0, np.full(50, 3.0)), **changed)
+    assert str(caught.value).startswith(f"segment of driver 'one': {message}")
+    assert "\n" not in str(caught.value)
+
+
 def test_arguments_are_checked(known):
     _, recorded, _ = known
+    with pytest.raises(ValueError, match="segment of driver 'one': 1 samples; 2 or more"):
+        stack([segment(10.0, 3.0, np.full(1, 3.0))])
+    for name, value in (("shortest", np.nan), ("speed_limit", -5.0), ("starts", 0)):
+        with pytest.raises(ValueError, match=f"{name} = .*; a finite number above 0 is expected"):
+            calibrate("none.csv", **{name: value})
+    with pytest.raises(ValueError, match="driver '000': Lost gives no finite gaps for any parameters"):
+        fit(recorded[:1], Lost(), starts=1)
     with pytest.raises(ValueError, match="objective 'rmse' is unknown"):
         fit(recorded, objective="rmse")
     with pytest.raises(ValueError, match="method 'ga' is unknown"):

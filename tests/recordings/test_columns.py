@@ -1,11 +1,14 @@
 """Tables of one's own: fields, units, and what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from limsim_jax.calibration.cleaning import segments
 from limsim_jax.recordings import RecordingError, read_columns, read_recording, read_recordings
 
 DT, LENGTH = 0.1, 4.5
@@ -93,6 +96,50 @@ def test_several_tables_are_several_recordings():
     assert [recording.source for recording in found] == ["data 0", "data 1"]
     with pytest.raises(RecordingError, match="at least one file or table is expected"):
         read_recordings([])
+
+
+@pytest.mark.parametrize(
+    ("field", "row", "value", "message"),
+    [
+        ("x", 17, np.nan, "data: row 17, column follower: 'nan'; a finite number is expected"),
+        ("x_lead", 17, np.inf, "data: row 17, column leader: 'inf'; a finite number is expected"),
+        ("length_lead", 3, np.nan, "data: row 3, column length_lead: 'nan'; a finite number is expected"),
+        ("time", 40, 1.0, "data: row 40, column t: '1'; a time after that of the row before is expected"),
+        ("v", None, V[:-1], "data: v has 299 rows, time 300; equally many are expected"),
+    ],
+)
+def test_a_recording_made_by_hand_is_checked_as_well(field, row, value, message):
+    recording = read_columns(pair(), columns=COLUMNS, length=LENGTH)
+    values = value if row is None else at(getattr(recording, field), row, value)
+    with pytest.raises(RecordingError) as caught:
+        segments(replace(recording, **{field: values}))
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(("field", "value"), [("v", -3.0), ("v", 1e9), ("v_lead", 80.0)])
+def test_an_impossible_speed_costs_its_stretch_and_is_named(field, value):
+    data = {"time": T, "x": X, "x_lead": X_LEAD, "v": V, "v_lead": V_LEAD}
+    data[field] = at(data[field], 280, value)
+    found, quality = segments(read_columns(data, length=LENGTH))
+    assert f"row 280, column {field}: {value:g} m/s; 0 to 70 m/s are expected" in quality.findings
+    assert quality.dropped["impossible speeds"] == pytest.approx(DT)
+    assert [len(one) for one in found] == [270]
+    with pytest.raises(RecordingError, match="so are 1 of 300 rows"):
+        read_columns(data, length=LENGTH, tolerated=0.0)
+
+
+def test_an_overlap_names_the_gap_if_that_is_what_the_table_tells():
+    data = {"time": T, "gap": at(GAP, 40, -3.0), "v": V, "v_lead": V_LEAD}
+    with pytest.raises(RecordingError, match="row 40, column gap: follower overlaps its leader leader by 3"):
+        read_columns(data, tolerated=0.0)
+
+
+def test_bodies_that_touch_once_smoothed_cost_their_stretch():
+    """A gap of 1 cm that shakes by 1 m for a moment: recorded above 0, smoothed below."""
+    shake = 1.0 * (np.arange(300) == 150)
+    data = {"time": T, "x": X, "gap": 0.01 + shake, "v": V, "v_lead": V}
+    with pytest.raises(RecordingError, match="bodies that touch once smoothed: 30 s"):
+        segments(read_columns(data, length=LENGTH))
 
 
 def at(values, row, value):
