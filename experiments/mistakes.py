@@ -399,6 +399,14 @@ CASES = (
         code=0,
         runs=True,
     ),
+    recording("bounds the wrong way round", "bounds: T within .*0 < low < high", options="--bounds T=3:0.3"),
+    recording("bounds of an unknown parameter", "bounds: no parameter 'tau'", options="--bounds tau=1:2"),
+    recording(
+        "an impossible speed with `--tolerated 0`",
+        "line 52, column v: -20 m/s; 0 to 70 m/s are expected; so are 1 of 400 rows",
+        ("5.0,50,10,", "5.0,50,-20,"),
+        "--tolerated 0",
+    ),
     recording("a recording that is too short", "a.csv.*--shortest", (GPS, "\n".join(GPS.splitlines()[:50]))),
     Case("Maps", "a file that is no map", "map info a.xodr", "a.xodr", files={"a.xodr": "<OpenDRIVE"}),
     Case(
