@@ -143,8 +143,8 @@ def test_refuses():
 
 def test_followers_outside_periods_are_cut_from_segments():
     found = [
-        segment("a", "z", 7, np.arange(400.0), 1.0, 2.0),
-        segment("b", "a", 150, np.arange(90.0), 3.0, 1.0),
+        segment("a", "z", 7, 1 + np.arange(400.0), 1.0, 2.0),
+        segment("b", "a", 150, 1 + np.arange(90.0), 3.0, 1.0),
     ]
     found += [replace(found[1], source="other", time=0.0)]
     linked = link(found, period=10.0, settle=1.0)
@@ -155,7 +155,7 @@ def test_followers_outside_periods_are_cut_from_segments():
     assert [(x.driver, x.source, round(x.time, 6), len(x)) for x in left] == [
         ("a", "made up", 20.7, 200), ("b", "other", 0.0, 90)
     ]  # fmt: skip
-    assert left[0].gap[0] == 200.0
+    assert left[0].gap[0] == 201.0
     # a period without anything to compare is left out, and those after it keep their times
     gone = link([found[0].part(0, 100), found[0].part(200, 300), found[2]], period=10.0, settle=1.0)
     assert [name.split()[-2] for name in gone.periods] == ["0", "20", "0"]
