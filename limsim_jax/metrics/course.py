@@ -1,8 +1,9 @@
-"""Whether two vehicles are on a course to meet: both go on along their lanes, not along straight lines.
+"""When two vehicles meet that go on along their lanes.
 
 A straight line through a bend leads into the oncoming lane, and one from the middle of a turn into a vehicle
-that waits beside it. So a time to collision of boxes that keep their velocities counts only if the bodies
-also meet along their paths.
+that waits beside it. A lane change ends in the middle of the next lane, but a straight line through it goes
+on across. So a time to collision of boxes that keep their velocities counts only if the bodies also meet
+along their paths.
 """
 
 from __future__ import annotations
@@ -13,8 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose
-from limsim_jax.metrics.safety import encounter, overlaps
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, width
+from limsim_jax.metrics.safety import NONE, encounter, overlaps
+from limsim_jax.numerics import safe_divide
+from limsim_jax.traffic.ego import at_slots, is_free
+from limsim_jax.traffic.motion import lateral_speed
+from limsim_jax.traffic.parameters import LANE_CHANGES
+from limsim_jax.types import State
 
 COURSE = 5.0
 """s for which paths are followed; a longer time to collision is not checked."""
@@ -25,8 +31,15 @@ _EVERY = 0.25  # s between looks: at 20 m/s less than the length of a body
 class Course(NamedTuple):
     """How others drive relative to the ego, `[N]`."""
 
-    meets: Bool[Array, " N"]  # bodies touch within `COURSE` s if both keep to their lanes and speeds
+    meets: Float[Array, " N"]  # s from now, not before that bodies touch along their lanes; `NONE`
     follows: Bool[Array, " N"]  # it drives behind the ego on a path that leads over the ego's lane
+
+
+class Aside(NamedTuple):
+    """How vehicles go on across their lanes, `[N]`; `to` 0: they keep their offset."""
+
+    to: Float[Array, " N"]  # m, left > 0: from here to the middle of the lane that they move to
+    pace: Float[Array, " N"]  # m/s, how fast
 
 
 class OnLanes(NamedTuple):
@@ -37,14 +50,43 @@ class OnLanes(NamedTuple):
     s: Float[Array, " N"]  # m, front bumper
     v: Float[Array, " N"]  # m/s
     box: Float[Array, "N 5"]  # x, y (m), heading (rad), length, width (m)
+    aside: Aside
+    other: Int[Array, " N"]  # the second lane of a vehicle that changes lanes, `NO_LANE` for all others
+
+
+@jax.named_scope("aside")
+def aside(lane_map: LaneMap, state: State) -> Aside:
+    """How vehicles go on across their lanes.
+
+    A lane change ends in the middle of the lane that it leads to, in the time that it still takes. An ego in
+    the plane that is over a line, or signals, goes on as fast as now: to the middle of the lane that lies
+    there, or across, if there is none.
+    """
+    egos, free = state.egos, is_free(state)
+    heading = pose(lane_map, state.lane[egos.slot], state.s[egos.slot])[2]
+    across = state.v[egos.slot] * jnp.sin(egos.heading - heading)
+    w = at_slots(egos, across, lateral_speed(state), egos.free)
+    half = width(lane_map, state.lane, state.s) / 2
+    over = jnp.abs(state.d) + state.shape.width / 2 > half
+    shown = state.side.astype(w.dtype)
+    leaves = ((state.d * w > 0) & over) | (shown * w > 0)
+    side = jnp.where(free, jnp.where(leaves, jnp.sign(w), 0), jnp.where(state.crossed, 0, shown))
+    beside = jnp.where(side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
+    between = half + width(lane_map, beside, side_s(lane_map, state.lane, state.s, side)) / 2
+    to = jnp.where(beside == NO_LANE, w * COURSE, side * between - state.d)
+    to = jnp.where(side == 0, -state.d, to)
+    goes = state.active & jnp.where(free, leaves | (over & (state.d * w < 0)), state.side != 0)
+    left = (1 - state.progress) * state.driver.lane_change_time  # s, at least
+    pace = jnp.minimum(state.v / LANE_CHANGES.creep_speed, 1) * safe_divide(jnp.abs(to), left)
+    return Aside(to=jnp.where(goes, to, 0), pace=jnp.where(free, jnp.abs(w), pace))
 
 
 @jax.named_scope("course")
 def course(lane_map: LaneMap, slot: Int[Array, ""], vehicles: OnLanes) -> Course:
     """The course of all vehicles relative to the ego in `slot`.
 
-    Bodies keep their offset and their angle to the lane. A vehicle whose lane is not among its `way` may
-    meet any.
+    Bodies keep their offset and their angle to the lane, but for what they still go `aside`. A vehicle whose
+    lane is not among its `way` may meet any.
     """
     way, lane = vehicles.way, vehicles.lane
     here = (way == lane[:, None]) & (lane != NO_LANE)[:, None]
@@ -55,12 +97,24 @@ def course(lane_map: LaneMap, slot: Int[Array, ""], vehicles: OnLanes) -> Course
     def touching(ego: Float[Array, " 5"], others: Float[Array, "N 5"]) -> Bool[Array, " N"]:
         return overlaps(encounter(ego, none[0, 0], others, none[:, 0]))
 
-    touches = jax.vmap(touching, (0, 1))(box[slot], box).any(0)
+    touches = jax.vmap(touching, (0, 1))(box[slot], box)  # [T, N]
+    first = jnp.argmax(touches, 0).astype(box.dtype) - 1  # it may have been any time since the look before
+    meets = jnp.where(touches.any(0), jnp.maximum(first, 0) * _EVERY, NONE)
     mine, same = way[slot], lane == lane[slot]
     leads = (lane[:, None] == mine[None, :]).any(-1) & ~same
     over = (way == lane[slot]).any(-1) & (lane[slot] != NO_LANE)
     follows = over & ~leads & ~(same & (vehicles.s >= vehicles.s[slot]))
-    return Course(meets=touches | ~known | ~known[slot], follows=follows)
+    return Course(meets=jnp.where(known & known[slot], meets, 0), follows=follows | _behind(vehicles, slot))
+
+
+def _behind(vehicles: OnLanes, slot: Int[Array, ""]) -> Bool[Array, " N"]:
+    """Vehicles behind the ego on the lane of a lane change."""
+    lane, other, x, y = vehicles.lane, vehicles.other, vehicles.box[:, 0], vehicles.box[:, 1]
+    joins = (other == lane[slot]) & (other != NO_LANE)
+    joined = (lane == other[slot]) & (lane != NO_LANE)
+    heading = vehicles.box[slot, 2]
+    ahead = jnp.cos(heading) * (x - x[slot]) + jnp.sin(heading) * (y - y[slot])
+    return (joins | joined) & (ahead < 0)
 
 
 def _ahead(lane_map: LaneMap, vehicles: OnLanes, first: Int[Array, " N"]) -> Float[Array, "N T 5"]:
@@ -76,14 +130,18 @@ def _ahead(lane_map: LaneMap, vehicles: OnLanes, first: Int[Array, " N"]) -> Flo
     column = jnp.sum(beyond, -1, dtype=jnp.int32)
     lane = jnp.take_along_axis(way, column, -1)
     x, y, heading = pose(lane_map, lane, along - jnp.take_along_axis(start, column, -1))
-    # where the body is as its path sees it stays the same
+    # where the body is as its path sees it stays the same, until it has gone aside
+    to, pace = (value[:, None] for value in vehicles.aside)
+    gone = jnp.minimum(pace * time[None], jnp.abs(to))
+    turned = jnp.where((to != 0) & (gone >= jnp.abs(to)), 0, box[:, 2:3] - heading[:, :1])
     cos, sin = jnp.cos(heading), jnp.sin(heading)
     dx, dy = box[:, :1] - x[:, :1], box[:, 1:2] - y[:, :1]
     ahead, left = cos[:, :1] * dx + sin[:, :1] * dy, cos[:, :1] * dy - sin[:, :1] * dx
+    left = left + jnp.sign(to) * gone
     shape = jnp.broadcast_to(box[:, None, 3:], (*x.shape, 2))
     place = (
         x + cos * ahead - sin * left,
         y + sin * ahead + cos * left,
-        heading + box[:, 2:3] - heading[:, :1],
+        heading + turned,
     )
     return jnp.concatenate([jnp.stack(place, -1), shape], -1)

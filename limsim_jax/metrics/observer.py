@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.metrics.catalog import DERIVED, EGO, TRAFFIC
-from limsim_jax.metrics.course import Course, OnLanes, course
+from limsim_jax.metrics.course import Aside, Course, OnLanes, aside, course
 from limsim_jax.metrics.description import Description
 from limsim_jax.metrics.ego import EgoCarry, EgoMetrics
 from limsim_jax.metrics.measure import Metric, Own, check_names
@@ -31,7 +31,7 @@ from limsim_jax.metrics.record import (
     with_leader,
 )
 from limsim_jax.metrics.reductions import Measured
-from limsim_jax.metrics.safety import Rss
+from limsim_jax.metrics.safety import NONE, Rss
 from limsim_jax.metrics.step import EgoStep
 from limsim_jax.metrics.traffic import Detectors, TrafficCarry, TrafficMetrics, TrafficStep
 from limsim_jax.traffic.engine import Tick
@@ -53,6 +53,7 @@ class StepRecord(NamedTuple):
     traffic: TrafficStep
     other: Int[Array, " N"]  # the second lane of a vehicle that changes lanes
     way: Int[Array, "N D"]  # lanes to come
+    aside: Aside
     stopped: Bool[Array, "*e"]  # the ego has stopped at the stop sign ahead
     goal: Int[Array, "*e"]  # of the ego now
 
@@ -119,7 +120,8 @@ class EvaluateEgo:
             raise ValueError(f"ego {self._last} is measured, but the world has {rows} egos")
         first = self._record(lane_map, at_start(config, state))
         any_ = jnp.ones(state.lane.shape[0], bool)
-        vehicles = any_, Course(meets=~any_, follows=~any_)  # no paths are known yet
+        never = jnp.full(any_.shape, NONE)  # no paths are known yet
+        vehicles = any_, Course(meets=never, follows=~any_)
 
         def begin(step: EgoStep, stopped: Bool[Array, ""], goal: Int[Array, ""]) -> EgoState:
             carry = EgoState(
@@ -150,14 +152,7 @@ class EvaluateEgo:
         self, config: Config, lane_map: LaneMap, carry: MetricState, records: StepRecord
     ) -> MetricState:
         """Add the records since the last decision, `[decision_every, ...]`."""
-        way, other = records.way[0], records.other.max(0)
-        flow, box = records.traffic, records.ego.box[0]
-        vehicles = OnLanes(way, flow.lane[0], flow.s[0], flow.v[0], box)
-
-        def seen(slot: Int[Array, ""]) -> tuple[Bool[Array, " N"], Course]:
-            return meets_ego(lane_map, slot, way, other), course(lane_map, slot, vehicles)
-
-        relevant = self._each(seen, (0,))(records.ego.slot[0])
+        relevant = self._each(lambda slot: paths(lane_map, slot, records), (0,))(records.ego.slot[0])
         _, traffic = self._metrics(config)
 
         def one(carry: MetricState, record: StepRecord) -> tuple[MetricState, None]:
@@ -202,6 +197,7 @@ class EvaluateEgo:
             traffic=traffic_step(state, snapshot.left, snapshot.time, snapshot.dx),
             other=other_lane(lane_map, state)[0],
             way=state.lane[:, None],
+            aside=aside(lane_map, state),
             stopped=stopped,
             goal=goal,
         )
@@ -237,7 +233,7 @@ class EvaluateEgo:
         meets, how = relevant
         step = step._replace(
             relevant=meets,
-            course=how.meets,
+            meets=how.meets,
             follows=how.follows,
             to_go=to_go,
             on_route=on_route,
@@ -322,6 +318,19 @@ class EvaluateTraffic:
     def result(self, config: Config, lane_map: LaneMap, carry: TrafficCarry) -> dict[str, Measured]:
         """All columns of `units`."""
         return _flow_result(TrafficMetrics(config.dt), lane_map, carry)
+
+
+def paths(lane_map: LaneMap, slot: Int[Array, ""], records: StepRecord) -> tuple[Bool[Array, " N"], Course]:
+    """Of the records since a decision: paths that may meet that of the ego in `slot`, and when they do.
+
+    Times of meeting are in s since the start of the world.
+    """
+    flow, way = records.traffic, records.way[0]
+    now = jax.tree.map(lambda x: x[0], records.aside)
+    vehicles = OnLanes(way, flow.lane[0], flow.s[0], flow.v[0], records.ego.box[0], now, records.other[0])
+    found = course(lane_map, slot, vehicles)
+    relevant = meets_ego(lane_map, slot, way, records.other.max(0))
+    return relevant, found._replace(meets=found.meets + flow.t[0])
 
 
 def _flow(metrics: TrafficMetrics, carry: TrafficCarry, step: TrafficStep) -> TrafficCarry:

@@ -109,7 +109,7 @@ def ego_step(
         active=seen,
         b_max=state.driver.b_max,
         relevant=seen,
-        course=seen,
+        meets=jnp.zeros_like(state.v),
         follows=jnp.zeros_like(seen),
         changing=(state.side != 0) | straddles | snapshot.off_road,
         violation=signals.violation,

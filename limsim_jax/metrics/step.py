@@ -21,6 +21,7 @@ from limsim_jax.metrics.safety import (
     drac,
     encounter,
     first_touch,
+    greater,
     reach,
     ttc_1d,
 )
@@ -37,7 +38,7 @@ class EgoStep(NamedTuple):
     active: Bool[Array, " N"]  # on the road, and on the level of the ego
     b_max: Float[Array, " N"]  # m/s^2, hardest braking
     relevant: Bool[Array, " N"]  # their path may meet the ego's: not those that keep to another lane
-    course: Bool[Array, " N"]  # along their paths they meet the ego, see `course.COURSE`
+    meets: Float[Array, " N"]  # s, time from which they may meet the ego along their lanes; `NONE`
     follows: Bool[Array, " N"]  # they drive behind the ego on its path
     changing: Bool[Array, " N"]  # in several lanes, or off the drivable area
     violation: Bool[Array, " N"]  # drives where another one has priority: red light, wrong way, right of way
@@ -219,23 +220,23 @@ class StepView:
 
     @cached_property
     def ttc_on_course(self) -> Float[Array, " N"]:
-        """Time to collision of boxes that keep their velocities, s; `NONE` for none.
+        """Time to collision on straight lines and along lanes, s.
 
-        A vehicle counts if it touches the ego, or if all of these hold:
+        The later of both, `NONE` for none. From `COURSE` s on only straight lines count. A vehicle counts if
+        it touches the ego, or if all of these hold:
 
         - its path may meet that of the ego, or the ego leaves its lane;
-        - both also meet if they follow their lanes (up to `COURSE` s), or they drive in one direction and one
-          of them leaves its lane;
+        - it meets the ego on straight lines, and within `COURSE` s along the lanes and lane changes of both;
         - it does not close up calmly behind the ego: it would have to brake harder than `FIRM_BRAKING`.
         """
         record, e = self.record, self.encounter
         leaving = record.changing[self.slot]
-        beside = (leaving | record.changing) & (e.cos > 0)
-        course = record.course | beside | (self.ttc >= COURSE)
+        along = record.meets - self.time
+        along = jnp.where(self.touches | (self.ttc >= COURSE), 0, along)
         behind = jnp.maximum(-e.x - reach(e)[0], 0)  # m, of the other's front to the ego's tail
         calm = record.follows & (drac(behind, e.u, jnp.zeros_like(e.u)) <= FIRM_BRAKING)
-        counts = ((record.relevant | leaving) & course & ~calm) | self.touches
-        return jnp.where(self.apart & counts, self.ttc, NONE)
+        counts = ((record.relevant | leaving) & (along < COURSE) & ~calm) | self.touches
+        return jnp.where(self.apart & counts, greater(self.ttc, along), NONE)
 
     @cached_property
     def least_ttc_2d(self) -> Float[Array, ""]:

@@ -11,6 +11,7 @@ from ego_records import DT, FLAGS, LENGTH, PER_VEHICLE, WIDTH, as_steps, free, r
 from limsim_jax.metrics.blame import ContactType, Responsibility
 from limsim_jax.metrics.ego import NAMES, EgoMetrics
 from limsim_jax.metrics.reductions import on_host
+from limsim_jax.metrics.safety import NONE
 from limsim_jax.metrics.step import EgoStep
 
 METRICS = EgoMetrics(DT)
@@ -180,20 +181,25 @@ def test_a_collision_course_is_one_along_the_lanes_too():
     r = record(20, (0, 0, 0, 10.0), crossing)
     assert measure(r)["min_ttc"] < 0.5 and measure(r)["min_ttc_other"] == 1.0
     apart = {k: x.copy() for k, x in r.items()}
-    apart["course"][:, 1] = False
+    apart["meets"][:, 1] = NONE
     assert measure(apart)["min_ttc"] is None and measure(apart)["near_misses"] == 0.0
-    apart["changing"][:, 0] = True  # it comes from the side: a lane change leads nowhere near it
+    apart["changing"][:] = True  # a lane change is one of the paths
     assert measure(apart)["min_ttc"] is None
     far = record(3, (0, 0, 0, 10.0), [(100.0, -100.0, np.pi / 2, 10.0)])
-    far["course"][:, 1] = False
+    far["meets"][:, 1] = NONE
     assert measure(far)["min_ttc"] > 5.0  # so far ahead paths are not followed
-    side = record(12, (0, 0, 0.0, 10.0), [(1.0, 4.0, -0.1, 10.1)])
-    side["course"][:, 1] = False
-    assert measure(side)["min_ttc"] is None
-    for who in (0, 1):  # either of them leaves its lane
-        leaves = {k: x.copy() for k, x in side.items()}
-        leaves["changing"][:, who] = True
-        assert measure(leaves)["min_ttc"] < 1.0, who
+
+
+@pytest.mark.parametrize(("along", "ttc"), [(0.25, 0.25), (1.9, 1.9), (4.9, 4.9), (5.5, None)])
+def test_the_later_of_two_times_counts(along, ttc):
+    """A neighbour comes nearer at 1 m/s on a straight line; it is abreast 0.1 s away."""
+    r = record(2, (0, 0, 0, 10.0), [(0, -2.1, np.arctan(0.1), np.hypot(10.0, 1.0))])
+    r["velocity"][:, 1] = [10.0, 1.0]
+    r["box"][:, 1, :3] = r["box"][:, 0, :3] - np.array([0, 2.1, 0])
+    assert measure(r)["min_ttc"] == pytest.approx(0.1, abs=1e-3)
+    r["meets"][:, 1] = r["t"][-1] + along
+    found = measure(r)["min_ttc"]
+    assert found is None if ttc is None else found == pytest.approx(ttc, abs=1e-3)
 
 
 @pytest.mark.parametrize(("speed", "way", "near"), [(4.0, 10.0, 0.0), (14.0, 10.0, 1.0), (6.0, 3.0, 1.0)])
@@ -212,7 +218,7 @@ def test_a_vehicle_that_closes_up_calmly_behind_a_standing_ego_is_no_near_miss(s
 def test_a_vehicle_that_touches_is_met_wherever_it_is_going():
     r = record(31, (0, 0, 0, 20.0), [(30, 0, 0, 0.0)])  # it would be through the other in half a second
     assert measure(r)["contacts"] == 1.0
-    for name, value in (("relevant", False), ("course", False), ("follows", True)):
+    for name, value in (("relevant", False), ("meets", NONE), ("follows", True)):
         r[name][:, 1] = value
     found = measure(r)
     assert found["contacts"] == 1.0 and found["min_ttc"] == 0.0 and found["min_ttc_other"] == 1.0

@@ -10,7 +10,7 @@ from limsim_jax.metrics.step import EgoStep
 
 DT = 0.1
 LENGTH, WIDTH = 5.0, 2.0
-PER_VEHICLE = ("box", "velocity", "active", "b_max", "relevant", "course", "follows", "changing", "violation")
+PER_VEHICLE = ("box", "velocity", "active", "b_max", "relevant", "meets", "follows", "changing", "violation")
 FLAGS = (
     "on_lane",
     "on_route",
@@ -44,7 +44,7 @@ def record(steps, ego, others=(), **changes) -> dict[str, Any]:
         "active": np.ones((steps, n), bool),
         "b_max": np.full((steps, n), 8.0),
         "relevant": np.ones((steps, n), bool),
-        "course": np.ones((steps, n), bool),
+        "meets": np.zeros((steps, n)),
         "follows": np.zeros((steps, n), bool),
         "changing": np.zeros((steps, n), bool),
         "violation": np.zeros((steps, n), bool),

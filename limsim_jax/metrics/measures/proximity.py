@@ -72,10 +72,11 @@ class TimeToCollision(Measure):
             missing="The ego was never faster than a leader.",
         ),
         Description(
-            "min_ttc_2d", "s, least TTC of boxes that keep their velocity", "Safety", "higher",
-            formula="First time at which the boxes overlap, by the separating axes of moving boxes. It "
-            "counts if both also meet along their lanes within 5 s, or if one of them leaves its lane; of a "
-            "follower, if it would have to brake harder than 3.4 m/s^2.",
+            "min_ttc_2d", "s, least TTC of bodies in the plane", "Safety", "higher",
+            formula="First time at which boxes that keep their velocity overlap, by the separating axes of "
+            "moving boxes. Below 5 s the boxes must also meet along their lanes and lane changes, looked at "
+            "every 0.25 s; the later time counts. A follower counts if it would have to brake harder than "
+            "3.4 m/s^2.",
             source=_HAYWARD,
             missing=_NO_COLLISION,
         ),
