@@ -33,6 +33,7 @@ class Course(NamedTuple):
 
     meets: Float[Array, " N"]  # s from now, not before that bodies touch along their lanes; `NONE`
     follows: Bool[Array, " N"]  # it drives behind the ego on a path that leads over the ego's lane
+    leads: Bool[Array, " N"]  # it drives ahead of the ego on the ego's path
 
 
 class Aside(NamedTuple):
@@ -85,13 +86,14 @@ def aside(lane_map: LaneMap, state: State) -> Aside:
 def course(lane_map: LaneMap, slot: Int[Array, ""], vehicles: OnLanes) -> Course:
     """The course of all vehicles relative to the ego in `slot`.
 
-    Bodies keep their offset and their angle to the lane, but for what they still go `aside`. A vehicle whose
-    lane is not among its `way` may meet any.
+    Bodies keep their offset and their angle to the lane, but for what they still go `aside`. A vehicle that
+    has changed lanes since its `way` was known goes on along its lane; one without a lane may meet any.
     """
     way, lane = vehicles.way, vehicles.lane
-    here = (way == lane[:, None]) & (lane != NO_LANE)[:, None]
-    known = here.any(-1)
-    box = _ahead(lane_map, vehicles, jnp.argmax(here, -1))  # [N, T, 5]
+    here, known = way == lane[:, None], lane != NO_LANE
+    alone = jnp.full_like(way, NO_LANE).at[:, 0].set(lane)
+    way = jnp.where(here.any(-1)[:, None], way, alone)
+    box = _ahead(lane_map, vehicles._replace(way=way), jnp.argmax(here, -1))  # [N, T, 5]
     none = jnp.zeros_like(box[..., :2])
 
     def touching(ego: Float[Array, " 5"], others: Float[Array, "N 5"]) -> Bool[Array, " N"]:
@@ -100,21 +102,27 @@ def course(lane_map: LaneMap, slot: Int[Array, ""], vehicles: OnLanes) -> Course
     touches = jax.vmap(touching, (0, 1))(box[slot], box)  # [T, N]
     first = jnp.argmax(touches, 0).astype(box.dtype) - 1  # it may have been any time since the look before
     meets = jnp.where(touches.any(0), jnp.maximum(first, 0) * _EVERY, NONE)
-    mine, same = way[slot], lane == lane[slot]
-    leads = (lane[:, None] == mine[None, :]).any(-1) & ~same
-    over = (way == lane[slot]).any(-1) & (lane[slot] != NO_LANE)
-    follows = over & ~leads & ~(same & (vehicles.s >= vehicles.s[slot]))
-    return Course(meets=jnp.where(known & known[slot], meets, 0), follows=follows | _behind(vehicles, slot))
+    same = lane == lane[slot]
+    mine = (lane[:, None] == way[slot][None, :]).any(-1) & known
+    over = (way == lane[slot]).any(-1) & known[slot]
+    follows = over & ~(mine & ~same) & ~(same & (vehicles.s >= vehicles.s[slot]))
+    leads = mine & ~(same & (vehicles.s <= vehicles.s[slot]))
+    joins, ahead = _beside(vehicles, slot)
+    return Course(
+        meets=jnp.where(known & known[slot], meets, 0),
+        follows=follows | (joins & (ahead < 0)),
+        leads=leads | (joins & (ahead > 0)),
+    )
 
 
-def _behind(vehicles: OnLanes, slot: Int[Array, ""]) -> Bool[Array, " N"]:
-    """Vehicles behind the ego on the lane of a lane change."""
+def _beside(vehicles: OnLanes, slot: Int[Array, ""]) -> tuple[Bool[Array, " N"], Float[Array, " N"]]:
+    """Vehicles on the lane of a lane change, and m ahead."""
     lane, other, x, y = vehicles.lane, vehicles.other, vehicles.box[:, 0], vehicles.box[:, 1]
     joins = (other == lane[slot]) & (other != NO_LANE)
     joined = (lane == other[slot]) & (lane != NO_LANE)
     heading = vehicles.box[slot, 2]
     ahead = jnp.cos(heading) * (x - x[slot]) + jnp.sin(heading) * (y - y[slot])
-    return (joins | joined) & (ahead < 0)
+    return joins | joined, ahead
 
 
 def _ahead(lane_map: LaneMap, vehicles: OnLanes, first: Int[Array, " N"]) -> Float[Array, "N T 5"]:

@@ -121,7 +121,7 @@ class EvaluateEgo:
         first = self._record(lane_map, at_start(config, state))
         any_ = jnp.ones(state.lane.shape[0], bool)
         never = jnp.full(any_.shape, NONE)  # no paths are known yet
-        vehicles = any_, Course(meets=never, follows=~any_)
+        vehicles = any_, Course(meets=never, follows=~any_, leads=~any_)
 
         def begin(step: EgoStep, stopped: Bool[Array, ""], goal: Int[Array, ""]) -> EgoState:
             carry = EgoState(
@@ -235,6 +235,7 @@ class EvaluateEgo:
             relevant=meets,
             meets=how.meets,
             follows=how.follows,
+            leads=how.leads,
             to_go=to_go,
             on_route=on_route,
             arrived=leaves | reached,

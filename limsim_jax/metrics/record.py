@@ -111,6 +111,7 @@ def ego_step(
         relevant=seen,
         meets=jnp.zeros_like(state.v),
         follows=jnp.zeros_like(seen),
+        leads=jnp.zeros_like(seen),
         changing=(state.side != 0) | straddles | snapshot.off_road,
         violation=signals.violation,
         slot=slot,

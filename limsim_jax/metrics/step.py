@@ -40,6 +40,7 @@ class EgoStep(NamedTuple):
     relevant: Bool[Array, " N"]  # their path may meet the ego's: not those that keep to another lane
     meets: Float[Array, " N"]  # s, time from which they may meet the ego along their lanes; `NONE`
     follows: Bool[Array, " N"]  # they drive behind the ego on its path
+    leads: Bool[Array, " N"]  # they drive ahead of the ego on its path
     changing: Bool[Array, " N"]  # in several lanes, or off the drivable area
     violation: Bool[Array, " N"]  # drives where another one has priority: red light, wrong way, right of way
     slot: Int[Array, ""]  # of the ego
@@ -253,6 +254,22 @@ class StepView:
         """Slot of the vehicle with that time."""
         other = jnp.argmin(self.ttc_on_course).astype(self.leader.dtype)
         return jnp.where(self.least_ttc_1d < self.least_ttc_2d, self.leader, other)
+
+    @cached_property
+    def urgent_ttc(self) -> tuple[Float[Array, ""], Int[Array, ""]]:
+        """Least urgent time to collision, s, and slot of that vehicle.
+
+        As `least_ttc`, but a vehicle that the ego closes up to from behind counts only if the ego must brake
+        harder than `FIRM_BRAKING`.
+        """
+        e = self.encounter
+        room = jnp.maximum(e.x - reach(e)[0], 0)  # m, of the ego's front to the other's tail
+        calm = self.record.leads & (drac(room, -e.u, jnp.zeros_like(e.u)) <= FIRM_BRAKING)
+        ttc = jnp.where(calm & ~self.touches, NONE, self.ttc_on_course)
+        lane = jnp.where(drac(self.gap, self.v, self.v_leader) > FIRM_BRAKING, self.least_ttc_1d, NONE)
+        other = jnp.argmin(ttc).astype(self.leader.dtype)
+        least = jnp.min(ttc)
+        return jnp.minimum(least, lane), jnp.where(lane < least, self.leader, other)
 
     # --- for metrics of one's own
 

@@ -53,13 +53,14 @@ def key_moments(
     m = metrics
     if "contact_time" not in m:
         return {name: np.asarray([], kind) for name, kind in _COLUMNS.items()}
+    ttc = m["near_miss_ttc"]
     nobody = np.full(len(seeds), np.nan)
     found = {
         "policy_failed": (m["policy_failed_time"], nobody, nobody, m["policy_failed"] > 0),
         "contact": (m["contact_time"], m["contact_delta_v"], m["contact_other"], m["contact_time"] >= 0),
         "off_road": (m["off_road_time"], m["off_road"], nobody, m["off_road_time"] >= 0),
         "red_light": (m["red_light_time"], m["red_lights"], nobody, m["red_light_time"] >= 0),
-        "near_miss": (m["min_ttc_time"], m["min_ttc"], m["min_ttc_other"], m["min_ttc"] < NEAR_MISS[0]),
+        "near_miss": (m["near_miss_time"], ttc, m["near_miss_other"], ttc < NEAR_MISS[0]),
         "hard_brake": (m["max_drac_time"], m["max_drac"], m["max_drac_other"], m["max_drac"] > FIRM_BRAKING),
         "unsafe": (m["rss_first_time"], nobody, nobody, m["rss_first_time"] >= 0),
         "score_drop": (m["worst_second_time"], m["worst_second"], nobody, m["worst_second"] < SCORE_DROP),

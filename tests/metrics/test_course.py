@@ -135,12 +135,15 @@ def test_who_follows_whom():
     box = jnp.stack([x, y, heading, jnp.full(6, 4.4), jnp.full(6, 1.8)], -1)
     vehicles = on_lanes(jnp.array(way, jnp.int32), lanes, s, jnp.full(6, 5.0), box)
     how = seen(lane_map, jnp.int32(0), vehicles)
-    assert how.follows.tolist() == [False, True, False, False, False, False]
-    assert how.meets[5] == 0  # not on its own way: it may meet any
+    assert how.follows.tolist() == [False, True, False, False, False, True]
+    assert how.leads.tolist() == [False, False, True, True, False, False]
+    assert how.meets[5] == NONE  # off its way since a lane change it goes on along its lane
     assert seen(lane_map, jnp.int32(3), vehicles).follows.tolist() == [True, True, True, False, False, False]
     circle = vehicles._replace(way=vehicles.way.at[3, 1].set(lane))  # ahead, and behind the long way round
     assert not seen(lane_map, jnp.int32(0), circle).follows[3]
-    assert not seen(lane_map, jnp.int32(5), vehicles).meets.any()  # of such an ego nothing is known either
+    lost = vehicles._replace(lane=lanes.at[5].set(NO_LANE))  # it may meet any
+    assert seen(lane_map, jnp.int32(0), lost).meets[5] == 0
+    assert not seen(lane_map, jnp.int32(5), lost).meets.any()
 
 
 def test_a_neighbour_that_cuts_in_is_met_if_it_is_abreast_or_too_slow():
@@ -249,5 +252,7 @@ def test_a_vehicle_behind_follows_on_a_lane_that_one_of_both_changes_to():
     for changes, behind in (([NO_LANE] * 3, False), ([beside, NO_LANE, NO_LANE], True)):
         how = seen(lane_map, jnp.int32(0), vehicles._replace(other=jnp.array(changes, jnp.int32)))
         assert how.follows.tolist() == [False, behind, False]
+        assert how.leads.tolist() == [False, False, behind]
     joins = vehicles._replace(other=jnp.array([NO_LANE, lane, lane], jnp.int32))
-    assert seen(lane_map, jnp.int32(0), joins).follows.tolist() == [False, True, False]
+    how = seen(lane_map, jnp.int32(0), joins)
+    assert how.follows.tolist() == [False, True, False] and how.leads.tolist() == [False, False, True]

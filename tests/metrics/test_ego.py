@@ -78,6 +78,7 @@ def test_a_free_drive():
         "min_pet", "min_pet_time", "min_distance", "rss_first_time", "contact_time", "contact_other",
         "contact_type", "contact_at_fault", "contact_responsibility", "contact_delta_v", "max_delta_v",
         "off_road_time", "red_light_time", "policy_failed_time", "min_ttc_other", "max_drac_other",
+        "near_miss_ttc", "near_miss_time", "near_miss_other",
     }  # fmt: skip
     # without traffic the limit is the reference: 10 of 15 m/s
     assert found["limsim_faithful_efficiency"] == pytest.approx(10 / 15, rel=1e-4)
@@ -213,6 +214,25 @@ def test_a_vehicle_that_closes_up_calmly_behind_a_standing_ego_is_no_near_miss(s
     r["follows"][:, 1] = True
     found = measure(r)
     assert found["near_misses"] == near and found["contacts"] == 0.0
+
+
+@pytest.mark.parametrize(("speed", "way", "near"), [(4.0, 10.0, 0.0), (14.0, 10.0, 1.0), (6.0, 3.0, 1.0)])
+@pytest.mark.parametrize("leader", [False, True])
+def test_an_ego_that_closes_up_calmly_behind_a_standing_vehicle_has_no_near_miss(speed, way, near, leader):
+    """As the test before with the roles swapped; its time to collision is measured all the same."""
+    v = np.maximum(speed - speed**2 / (2 * way) * DT * np.arange(61), 0.0)
+    stop = float(np.sum(v[1:]) * DT)
+    r = record(61, (0, 0, 0, v), [(stop + 0.5 + LENGTH, 0, 0, 0.0), (500.0, 0, 0, 10.0)])
+    assert measure(r)["near_misses"] == 1.0
+    r["leads"][:, 1:] = True
+    if leader:  # the gap along the lane counts too
+        r["lead"][:] = 1
+        r["lead_gap"] = r["box"][:, 1, 0] - r["box"][:, 0, 0] - LENGTH
+    found = measure(r)
+    assert found["near_misses"] == near and found["min_ttc"] < 1.5
+    assert found["near_miss_other"] == (1.0 if near else None)
+    if near:
+        assert found["near_miss_ttc"] < 1.5 and found["near_miss_time"] > r["t"][0]
 
 
 def test_a_vehicle_that_touches_is_met_wherever_it_is_going():
@@ -598,12 +618,12 @@ def test_slots_do_not_matter():
     orders = [rng.permutation(12) for _ in records]
     a = on_host(many(stack(records)))
     b = on_host(many(stack([shuffled(r, order) for r, order in zip(records, orders, strict=True)])))
-    slots = ("contact_other", "min_ttc_other", "max_drac_other")
+    slots = ("contact_other", "min_ttc_other", "max_drac_other", "near_miss_other")
     others = {name: (a.pop(name), b.pop(name)) for name in slots}
     assert_same(a, b)
     for name, (here, there) in others.items():
         for k, order in enumerate(orders):
-            if not np.isnan(here[k]) and not (name == "min_ttc_other" and a["min_ttc"][k] == 0):  # of several
+            if not np.isnan(here[k]) and not ("contact" not in name and a["min_ttc"][k] == 0):  # of several
                 assert np.argsort(order)[int(here[k])] == int(there[k]), name
         assert np.sum(~np.isnan(here)) > 3, name
     assert np.nanmin(a["min_pet"]) < 1 and np.nanmax(a["contacts"]) > 1

@@ -92,7 +92,7 @@ def test_labels_are_not_averaged():
     rows = rows_of(made({ONE: {"contact_other": [3, 8], "contact_type": [1, 5], "contacts": [1, 1]}}))
     assert not {"contact_other", "contact_type", "seed", "digest"} & set(rows)
     labels = {name for name, meaning in UNITS.items() if describe(name, meaning).kind == "label"}
-    slots = {"contact_other", "min_ttc_other", "max_drac_other"}
+    slots = {"contact_other", "min_ttc_other", "max_drac_other", "near_miss_other"}
     assert labels == slots | {"contact_type", "contact_responsibility"}
 
 

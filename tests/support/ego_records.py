@@ -10,7 +10,18 @@ from limsim_jax.metrics.step import EgoStep
 
 DT = 0.1
 LENGTH, WIDTH = 5.0, 2.0
-PER_VEHICLE = ("box", "velocity", "active", "b_max", "relevant", "meets", "follows", "changing", "violation")
+PER_VEHICLE = (
+    "box",
+    "velocity",
+    "active",
+    "b_max",
+    "relevant",
+    "meets",
+    "follows",
+    "leads",
+    "changing",
+    "violation",
+)
 FLAGS = (
     "on_lane",
     "on_route",
@@ -46,6 +57,7 @@ def record(steps, ego, others=(), **changes) -> dict[str, Any]:
         "relevant": np.ones((steps, n), bool),
         "meets": np.zeros((steps, n)),
         "follows": np.zeros((steps, n), bool),
+        "leads": np.zeros((steps, n), bool),
         "changing": np.zeros((steps, n), bool),
         "violation": np.zeros((steps, n), bool),
         "slot": np.zeros(steps, np.int32),

@@ -198,7 +198,7 @@ def rows(**columns):
     """Two worlds in which nothing is measured but what is told."""
     names = (
         "contact_time contact_delta_v contact_other contact_responsibility off_road_time off_road "
-        "red_light_time red_lights min_ttc_time min_ttc min_ttc_other max_drac_time max_drac "
+        "red_light_time red_lights near_miss_time near_miss_ttc near_miss_other max_drac_time max_drac "
         "max_drac_other rss_first_time policy_failed policy_failed_time "
         "worst_second_time worst_second"
     ).split()
@@ -213,8 +213,8 @@ def test_key_moments_are_ranked():
         np.array([0, 0], np.int32),
         rows(
             contact_time=[nan, 12.0], contact_delta_v=[nan, 6.5], contact_other=[nan, 4],
-            contact_responsibility=[nan, 1], min_ttc_time=[3.0, 11.9], min_ttc=[1.2, 0.0],
-            max_drac_time=[5.0, 4.0], max_drac=[3.3, 4.4], max_drac_other=[2, 3], min_ttc_other=[6, 4],
+            contact_responsibility=[nan, 1], near_miss_time=[3.0, 11.9], near_miss_ttc=[1.2, 0.0],
+            max_drac_time=[5.0, 4.0], max_drac=[3.3, 4.4], max_drac_other=[2, 3], near_miss_other=[6, 4],
             rss_first_time=[2.0, nan],
             off_road_time=[nan, 13.0], off_road=[0, 0.1],
             worst_second_time=[8.0, 9.0], worst_second=[50.0, 49.5],

@@ -26,6 +26,7 @@ from limsim_jax.metrics.step import StepView
 
 _HAYWARD = "Hayward 1972"
 _NO_COLLISION = "No vehicle was on a course to collide with the ego."
+_NO_NEAR_MISS = "No TTC that counts was below 1.5 s."
 _NO_LEADER = "No vehicle led the ego on its lane."
 
 
@@ -37,6 +38,8 @@ class TtcCarry(NamedTuple):
     lane: Least
     boxes: Least
     exposed: Float[Array, ""]  # s
+    urgent: Least
+    urgent_other: Int[Array, ""]  # slot
     near: Episodes
     near_contact: Bool[Array, ""]  # the near miss that goes on has become a contact
     near_contacts: Int[Array, ""]
@@ -89,7 +92,23 @@ class TimeToCollision(Measure):
             "near_misses", "times that the TTC fell below 1.5 s, without those that ended in a contact",
             "Safety",
             "lower",
-            formula="Begins when the TTC falls below 1.5 s and ends when it exceeds 2 s.",
+            formula="Begins when the TTC falls below 1.5 s and ends when it exceeds 2 s. Of two vehicles one "
+            "behind the other it counts if the one behind would have to brake harder than 3.4 m/s^2.",
+        ),
+        Description(
+            "near_miss_ttc", "s, least TTC of a near miss or contact", "Safety", "higher",
+            formula="Least TTC that counts for near_misses.",
+            missing=_NO_NEAR_MISS,
+        ),
+        Description(
+            "near_miss_time", "s, when", "Safety",
+            formula="Time of the first step with the value of near_miss_ttc.",
+            missing=_NO_NEAR_MISS,
+        ),
+        Description(
+            "near_miss_other", "slot of the vehicle with near_miss_ttc", "Safety", kind="label",
+            formula="At near_miss_time.",
+            missing=_NO_NEAR_MISS,
         ),
     )  # fmt: skip
 
@@ -97,22 +116,35 @@ class TimeToCollision(Measure):
         """Nothing met."""
         empty, no = Least.empty(), jnp.zeros((), bool)
         return TtcCarry(
-            empty, jnp.int32(-1), empty, empty, jnp.zeros(()), Episodes.empty(), no, jnp.zeros((), jnp.int32)
+            both=empty,
+            other=jnp.int32(-1),
+            lane=empty,
+            boxes=empty,
+            exposed=jnp.zeros(()),
+            urgent=empty,
+            urgent_other=jnp.int32(-1),
+            near=Episodes.empty(),
+            near_contact=no,
+            near_contacts=jnp.zeros((), jnp.int32),
         )
 
     def update(self, carry: TtcCarry, step: StepView, derived: Derived) -> TtcCarry:
         """Add the times to collision of this step."""
         t, least = step.time, step.least_ttc
-        near = carry.near.add(least < NEAR_MISS[0], least > NEAR_MISS[1])
+        urgent, urgent_other = step.urgent_ttc
+        near = carry.near.add(urgent < NEAR_MISS[0], urgent > NEAR_MISS[1])
         near_contact = near.inside & (carry.near_contact | derived.hit)
         begun = (near_contact & ~carry.near_contact).astype(jnp.int32)
         both = carry.both.add(least, t, least < NONE)
+        most = carry.urgent.add(urgent, t, urgent < NEAR_MISS[0])
         return TtcCarry(
             both=both,
             other=jnp.where(_new(carry.both, both), step.least_ttc_other, carry.other),
             lane=carry.lane.add(step.least_ttc_1d, t, step.least_ttc_1d < NONE),
             boxes=carry.boxes.add(step.least_ttc_2d, t, step.least_ttc_2d < NONE),
             exposed=carry.exposed + jnp.where(step.drove & (least < EXPOSED), step.dt, 0),
+            urgent=most,
+            urgent_other=jnp.where(_new(carry.urgent, most), urgent_other, carry.urgent_other),
             near=near,
             near_contact=near_contact,
             near_contacts=carry.near_contacts + begun,
@@ -120,13 +152,17 @@ class TimeToCollision(Measure):
 
     def result(self, carry: TtcCarry, summary: Summary) -> dict[str, Measured]:
         """All columns."""
+        other, urgent_other = (x.astype(summary.duration.dtype) for x in (carry.other, carry.urgent_other))
         return {
             "min_ttc": carry.both.result(),
             "min_ttc_time": carry.both.when(),
-            "min_ttc_other": measured(carry.other.astype(summary.duration.dtype), carry.both.found),
+            "min_ttc_other": measured(other, carry.both.found),
             "min_ttc_1d": carry.lane.result(),
             "min_ttc_2d": carry.boxes.result(),
             "ttc_exposed": measured(carry.exposed, summary.started),
+            "near_miss_ttc": carry.urgent.result(),
+            "near_miss_time": carry.urgent.when(),
+            "near_miss_other": measured(urgent_other, carry.urgent.found),
             "near_misses": summary.number(carry.near.number - carry.near_contacts),
         }
 
