@@ -18,6 +18,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pyarrow.compute as pc
 from readme_tables import PAPER, policies
@@ -41,14 +42,14 @@ POLICIES = (
 )  # fmt: skip
 SEEDS = dict.fromkeys(PAPER, 1000) | {"long_route": 300}
 OWN = ("own_policies:Cautious", "own_policies:follower")
-EVENTS = ("success", "at_fault_contacts", "contacts")
+EVENTS = ("success", "at_fault_contacts", "contacts", "near_misses")
 MEANS = {"completion": "completion", "score": "limsim_faithful_drive", "nuplan": "nuplan_score"}
 
 
-def worlds(policy: str, scenario: str, seeds: int, few: int, out: Path) -> dict[str, Any]:
+def worlds(policy: str, scenario: str, seeds: int, few: int, out: Path, chunk: int | None) -> dict[str, Any]:
     """One cell of the table."""
     (experiment,) = read_experiments(scenario, policy=policy)
-    episodes = Episodes(experiment)
+    episodes = Episodes(experiment, chunk=None if chunk is None else min(chunk, seeds))
 
     def show(now: Progress) -> None:
         print(f"{scenario} / {policy}: {now.done} of {now.wanted} worlds, {now.elapsed:.0f} s", flush=True)
@@ -62,6 +63,7 @@ def worlds(policy: str, scenario: str, seeds: int, few: int, out: Path) -> dict[
         if name in {*EVENTS, *MEANS.values(), "traffic_collided", "traffic_gridlock"}
     }
     row: dict[str, Any] = {"policy": policy, "scenario": scenario, "seeds": seeds}
+    row["worlds_device"] = jax.local_devices()[0].device_kind
     row["knows"] = knows(build_policy(KNOWN[policy], {}))
     row |= summary(found)
     if few:
@@ -113,6 +115,7 @@ def main() -> None:
     parser.add_argument("--scenarios", nargs="+", default=list(PAPER), choices=list(PAPER))
     parser.add_argument("--skip", choices=("worlds", "decisions"))
     parser.add_argument("--out", type=Path, default=Path("results/policies"))
+    parser.add_argument("--chunk", type=int, help="worlds per call")
     options = parser.parse_args()
     if options.seeds is not None and options.seeds < 1:
         parser.error(f"--seeds {options.seeds}: expected at least 1")
@@ -141,7 +144,7 @@ def main() -> None:
                 parser.error(f"--skip worlds: none of {scenario} with {policy} have been run yet")
             row = kept.setdefault((scenario, policy), {})
             if options.skip != "worlds":
-                row |= worlds(policy, scenario, seeds, few, options.out)
+                row |= worlds(policy, scenario, seeds, few, options.out, options.chunk)
             if options.skip != "decisions":
                 row |= decisions(scenario, policy)
             print(json.dumps(row), flush=True)

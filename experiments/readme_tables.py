@@ -238,11 +238,11 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
     titles = {"decision_ms": "decision, ms", "amortised_ms": "per vehicle in a batch, ms"}
     times = {name: title for name, title in titles.items() if any(name in r for r in result["rows"])}
     heads = ["scenario", "policy", "knows", "seeds", "success, %", "route completion, %",
-             "LimSim driving score", "contact at fault, %", "others in contact", "gridlocks",
+             "LimSim driving score", "contact at fault, %", "near miss, %", "others in contact", "gridlocks",
              *times.values()]  # fmt: skip
     rows = [
         f"| {' | '.join(heads)} |",
-        f"|---|---|---|---:|---|---:|---|---|---:|---:|{'---:|' * len(times)}",
+        f"|---|---|---|---:|---|---:|---|---|---:|---:|---:|{'---:|' * len(times)}",
     ]
     parts = [[row, row | row["few"]] if few and "few" in row else [row] for row in result["rows"]]
     for r in itertools.chain.from_iterable(parts):
@@ -254,9 +254,13 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
             f"| {r['scenario']} | {r['policy']} | {r['knows']} | {r['seeds']:,} "
             f"| {success:.1f} [{low:.1f}, {high:.1f}] "
             f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}]{theirs} "
-            f"| {fault:.1f} (at most {bound:.1f}) "
+            f"| {fault:.1f} (at most {bound:.1f}) | {100 * r['near_misses'][0]:.1f} "
             f"| {r['others_collided']} | {r.get('gridlocks', '')} |{took}"
         )
+    devices = dict.fromkeys(r["worlds_device"] for r in result["rows"])
+    timed = dict.fromkeys(r["device"] for r in result["rows"] if "device" in r)
+    told = f"; decisions were timed on {' and '.join(timed)}" if timed else ""
+    rows += ["", f"Worlds ran on {' and '.join(devices)}{told}."]
     if "own" in result:
         told = (
             f"`{r['policy']}` {r['decision_ms']:.2g} ms, {r['amortised_ms']:.2g} ms in a batch, "
