@@ -265,7 +265,7 @@ class StepView:
         e = self.encounter
         room = jnp.maximum(e.x - reach(e)[0], 0)  # m, of the ego's front to the other's tail
         calm = self.record.leads & (drac(room, -e.u, jnp.zeros_like(e.u)) <= FIRM_BRAKING)
-        ttc = jnp.where(calm & ~self.touches, NONE, self.ttc_on_course)
+        ttc = jnp.where(calm, NONE, self.ttc_on_course)
         lane = jnp.where(drac(self.gap, self.v, self.v_leader) > FIRM_BRAKING, self.least_ttc_1d, NONE)
         other = jnp.argmin(ttc).astype(self.leader.dtype)
         least = jnp.min(ttc)

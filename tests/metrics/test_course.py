@@ -180,8 +180,11 @@ def test_a_neighbour_that_cuts_in_is_met_if_it_is_abreast_or_too_slow():
     two = two._replace(aside=Aside(jnp.array([0.0, -between]), jnp.array([0.0, 1.5])))
     assert seen(lane_map, jnp.int32(0), two).meets[1] == NONE
     # there a long body is straight again: as turned as on the way it would reach into the next lane
-    long = box.at[1].add(jnp.array([0.0, 0.0, -0.35, 7.0, 0.0]))
-    two = two._replace(box=long, aside=Aside(jnp.array([0.0, -between]), jnp.array([0.0, between / 2])))
+    front = pose(lane_map, lanes[0], jnp.float32(202.5))
+    long = box.at[0, :2].set(jnp.stack(front[:2])).at[1].add(jnp.array([0.0, 0.0, -0.35, 7.0, 0.0]))
+    two = two._replace(
+        box=long, s=s.at[0].add(5.0), aside=Aside(jnp.array([0.0, -between]), jnp.array([0.0, between / 2]))
+    )
     assert seen(lane_map, jnp.int32(0), two).meets[1] == NONE
 
 
