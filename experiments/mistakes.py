@@ -174,6 +174,46 @@ CASES = (
     ),
     experiment("an origin that does not exist", "ego.start: no origin, road or lane '9-'", ('"1-"', '"9-"')),
     experiment("a goal that does not exist", "ego.goal: no goal or lane '7'", ('"2-"', '"7"')),
+    experiment(
+        "a vehicle on top of the ego",
+        "vehicle.0: overlaps ego.0 at the start",
+        ("[ego]", '[[vehicle]]\nstart = "1-"\ns = 201.0\n\n[ego]'),
+    ),
+    experiment(
+        "a vehicle that drives backwards",
+        "vehicle.0.v: .*greater than or equal to 0, not -9",
+        ("[ego]", '[[vehicle]]\nstart = "1-"\nv = -9.0\n\n[ego]'),
+    ),
+    experiment(
+        "an action with two orders",
+        "vehicle.0.action.0: an action is one of .*; here is brake and leave",
+        ("[ego]", '[[vehicle]]\nstart = "1-"\naction = [{ brake = 3.0, leave = true }]\n\n[ego]'),
+    ),
+    experiment(
+        "an action of another simulator",
+        "vehicle.0.action.0.teleport: no such field; known are at, ",
+        ("[ego]", '[[vehicle]]\nstart = "1-"\naction = [{ teleport = 3.0 }]\n\n[ego]'),
+    ),
+    experiment(
+        "an obstacle beyond the lane",
+        "obstacle.s: 9999 m, but lane .* is only",
+        ("[ego]", '[[obstacle]]\nstart = "1-"\ns = 9999.0\n\n[ego]'),
+    ),
+    experiment(
+        "a work zone on no road",
+        "zone.0.where: no road or lane '77'; roads are",
+        ("[ego]", '[[zone]]\nwhere = "77"\nclosed = true\n\n[ego]'),
+    ),
+    experiment(
+        "a work zone that opens later",
+        "zone.0: a closed lane is closed for the whole episode",
+        ("[ego]", '[[zone]]\nwhere = "1"\nclosed = true\nend = 2.0\n\n[ego]'),
+    ),
+    experiment(
+        "a zone without effect",
+        "zone.0: a zone needs closed, speed_limit or friction",
+        ("[ego]", '[[zone]]\nwhere = "1"\n\n[ego]'),
+    ),
     experiment("a start without a goal", "ego: a goal is missing", ('goal = "2-"\n', "")),
     experiment("a start beyond the lane", "ego.s: 99999 m, but lane", ("s = 200.0", "s = 99999.0")),
     experiment("a lane that is not there", "ego.lane: 9, but", ("s = 200.0", "s = 200.0\nlane = 9")),
