@@ -19,6 +19,7 @@ from limsim_jax.policies.view import view_of
 from limsim_jax.simulation.rollout import Carry, Rollout
 from limsim_jax.sweeps.experiment import ExperimentError
 from limsim_jax.traffic.command import Command
+from limsim_jax.traffic.script import lanes_now
 from limsim_jax.types import Config, Schedule, State, Status
 
 if TYPE_CHECKING:
@@ -167,7 +168,7 @@ class Env:
         empty = Command()
         carry = self._run.init(self.lanes, start)._replace(memory=empty)
         sight = None if self._view is None else self._view.init(self.config, carry.state)
-        seen, sight = self._look(carry.state, sight, own)
+        seen, sight = self._look(carry.state, scenario.schedule, sight, own)
         nothing = jnp.zeros(self.egos, bool)
         state = EnvState(carry=carry, schedule=scenario.schedule, sight=sight, key=own, ended=nothing)
         return seen, state
@@ -195,16 +196,17 @@ class Env:
         over = state.ended | now.collided | now.off_road | now.arrived | now.broken
         reward = jnp.where(state.ended, 0.0, self.reward(last, now))
         truncated = after.state.step >= self._run.decisions * self.config.decision_every
-        seen, sight = self._look(after.state, state.sight, state.key)
+        seen, sight = self._look(after.state, state.schedule, state.sight, state.key)
         new = EnvState(carry=after, schedule=state.schedule, sight=sight, key=state.key, ended=over)
         return seen, new, reward, over, truncated, now
 
-    def _look(self, state: State, sight: Any, key: Key[Array, ""]) -> tuple[Any, Any]:
+    def _look(self, state: State, schedule: Schedule, sight: Any, key: Key[Array, ""]) -> tuple[Any, Any]:
         """The observation of the egos, and the memory of their view."""
+        lanes = lanes_now(self.config, self.lanes, schedule, state)
         if self._view is not None:
             now = jax.random.fold_in(key, state.step)
-            state, sight = self._view.look(self.config, self.lanes, state, sight, now)
-        return self.observe(self.config, self.lanes, state), sight
+            state, sight = self._view.look(self.config, lanes, state, sight, now)
+        return self.observe(self.config, lanes, state), sight
 
     def _info(self, before: State, after: State) -> Info:
         """Of the egos, between two states."""

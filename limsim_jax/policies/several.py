@@ -93,16 +93,9 @@ def joined(parts: Sequence[tuple[Command, int]]) -> Command:
 
     Args:
       parts: commands, each with the number of its rows.
-
-    Raises:
-      ValueError: trajectories and controls in one world.
     """
     commands = [command for command, _ in parts]
     trajectory = [c.trajectory for c in commands if c.trajectory is not None]
-    if trajectory and any(c.control is not None for c in commands):
-        raise ValueError(
-            "a planner that returns controls cannot be joined with one that returns trajectories"
-        )
 
     def rows(name: str, nothing: int) -> Array | None:
         """A field of all commands, `nothing` where a command has none."""
@@ -119,10 +112,16 @@ def joined(parts: Sequence[tuple[Command, int]]) -> Command:
         still = [jax.tree.map(lambda x: jnp.zeros(n, x.dtype), given) for _, n in parts]  # noqa: B023
         each = [y if c.control is None else c.control for c, y in zip(commands, still, strict=True)]
         control = jax.tree.map(lambda *x: jnp.concatenate(x), *each)
+    by_control = None
+    if trajectory and control is not None:
+        by_control = jnp.concatenate(
+            [jnp.full(n, c.trajectory is None and c.control is not None) for c, n in parts]
+        )
     brake = [c.brake for c in commands if c.brake is not None]
     return Command(
         trajectory=_at_moments(trajectory[-1], parts) if trajectory else None,
         control=control,
+        by_control=by_control,
         meta=rows("meta", -1),
         signal=rows("signal", 0),
         brake=jnp.stack(brake).any(0) if brake else None,

@@ -21,11 +21,13 @@ class Command:
 
     An ego without a command is driven by the traffic model. A free ego follows a trajectory or holds a
     control; without either it rolls on with straight wheels. An ego that keeps to lanes takes meta-actions.
+    Where some rows have a trajectory and others a control, `by_control` tells which.
     A row with a number that is not finite, or with an unknown meta-action, is broken: see `without_broken`.
     """
 
     trajectory: Trajectory | None = None
     control: Control | None = None
+    by_control: Bool[Array, " E"] | None = None  # rows that hold the control, although others follow
     meta: Int[Array, " E"] | None = None  # `Meta`, or -1: decide like the traffic
     brake: Bool[Array, " N"] | None = None  # these vehicles, egos or others, brake as hard as they can
     slot: Int[Array, " E"] | None = None  # that each row of `Egos` drives from now on, -1: none
@@ -46,11 +48,12 @@ def without_broken(state: State, command: Command) -> tuple[State, Command, Bool
     egos = state.egos
     there = state.active[egos.slot] & (egos.slot >= 0)
     broken = jnp.zeros_like(egos.free)
+    held = broken if command.by_control is None else command.by_control
     if command.trajectory is not None:
         found = command.trajectory
         samples = {name: getattr(found, name) for name in ("x", "y", "heading", "v")}
         finite = jnp.stack([jnp.isfinite(x).all(-1) for x in samples.values()]).all(0)
-        bad = egos.free & ~(finite & jnp.isfinite(found.t0))
+        bad = egos.free & ~(finite & jnp.isfinite(found.t0)) & ~held
         stand = {"x": egos.x, "y": egos.y, "heading": egos.heading, "v": jnp.zeros_like(egos.x)}
         samples = {name: jnp.where(bad[:, None], stand[name][:, None], x) for name, x in samples.items()}
         t0 = jnp.where(jnp.isfinite(found.t0), found.t0, 0)
@@ -59,6 +62,7 @@ def without_broken(state: State, command: Command) -> tuple[State, Command, Bool
     if command.control is not None:
         a, steering = command.control.acceleration, command.control.steering
         bad = egos.free & ~(jnp.isfinite(a) & jnp.isfinite(steering))
+        bad &= held | (command.trajectory is None)
         control = Control(acceleration=jnp.where(bad, 0, a), steering=jnp.where(bad, 0, steering))
         command = replace(command, control=control)
         broken |= bad

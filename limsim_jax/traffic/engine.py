@@ -436,6 +436,9 @@ def _control(
     still = jnp.zeros_like(state.egos.x)
     if command.trajectory is not None:
         control = track(config, limits, state, command.trajectory, config.time(state.step))
+        if command.control is not None and command.by_control is not None:
+            held = command.by_control
+            control = jax.tree.map(lambda own, x: jnp.where(held, own, x), command.control, control)
     elif command.control is not None:
         control = command.control
     else:  # hands off
