@@ -2,6 +2,7 @@
 
 import inspect
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -324,9 +325,12 @@ def test_arguments_are_checked(known):
     _, recorded, _ = known
     with pytest.raises(ValueError, match="segment of driver 'one': 1 samples; 2 or more"):
         stack([segment(10.0, 3.0, np.full(1, 3.0))])
-    for name, value in (("shortest", np.nan), ("speed_limit", -5.0), ("starts", 0)):
-        with pytest.raises(ValueError, match=f"{name} = .*; a finite number above 0 is expected"):
-            calibrate("none.csv", **{name: value})
+    wrong: list[dict[str, Any]] = [{"shortest": np.nan}, {"speed_limit": -5.0}, {"starts": 0}]
+    for argument in wrong:
+        with pytest.raises(
+            ValueError, match=f"{next(iter(argument))} = .*; a finite number above 0 is expected"
+        ):
+            calibrate("none.csv", **argument)
     with pytest.raises(ValueError, match="driver '000': Lost gives no finite gaps for any parameters"):
         fit(recorded[:1], Lost(), starts=1)
     with pytest.raises(ValueError, match="objective 'rmse' is unknown"):
