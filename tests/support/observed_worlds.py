@@ -136,7 +136,8 @@ def random_state(rng, slot: int, lane: int | None = None) -> State:
     ways = [g for g in goals if on[slot] != NO_LANE and m.routes.reachable[on[slot], g]]
     if ways and rng.random() < 0.9:
         goal[slot] = rng.choice(ways)
-    status = sum(int(bit) * rng.integers(0, 2, N) for bit in Status)
+    events = [bit for bit in Status if bit is not Status.SCRIPTED]
+    status = sum(int(bit) * rng.integers(0, 2, N) for bit in events)
     shape = Shape(
         length=f32(rng.uniform(2, 12, N)),
         width=f32(rng.uniform(1.0, 2.6, N)),
