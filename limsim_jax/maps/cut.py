@@ -34,13 +34,16 @@ def cut(network: Network, cuts: Cuts) -> Network:
       network: of a map.
       cuts: places by road and section, m along the road.
     """
-    places = {key: found for key, at in cuts.items() if (found := _places(network, *key, at))}
+    sections: dict[tuple[str, int], list[Lane]] = {}
+    for lane in network.lanes.values():
+        sections.setdefault((lane.road, lane.section), []).append(lane)
+    places = {key: found for key, at in cuts.items() if (found := _places(sections.get(key, []), at))}
     if not places:
         return network
     pieces = {
         lane.id: _pieces(lane, places.get((lane.road, lane.section), [])) for lane in network.lanes.values()
     }
-    sections = _sections(network, places)
+    numbers = _sections(network, places)
     first, last = ({name: found[k].id for name, found in pieces.items()} for k in (0, -1))
 
     def links(lane: Lane, k: int, piece: Lane) -> Lane:
@@ -55,7 +58,7 @@ def cut(network: Network, cuts: Cuts) -> Network:
         along = k if lane.road_s[-1] >= lane.road_s[0] else len(mine) - 1 - k
         return replace(
             piece,
-            section=sections[lane.road, lane.section] + along,
+            section=numbers[lane.road, lane.section] + along,
             successors=(mine[k + 1].id,) if k + 1 < len(mine) else after,
             predecessors=(mine[k - 1].id,) if k else before,
             **beside,
@@ -119,9 +122,8 @@ def _span(lanes: Mapping[str, Lane], name: str, enters: float, leaves: float) ->
     return piece, max(middle - half, 0.0), min(middle + half, lanes[piece].length)
 
 
-def _places(network: Network, road: str, section: int, at: Iterable[float]) -> list[float]:
+def _places(lanes: list[Lane], at: Iterable[float]) -> list[float]:
     """Where a section is cut, in order, m along the road."""
-    lanes = [lane for lane in network.lanes.values() if (lane.road, lane.section) == (road, section)]
     if not lanes or any(lane.junction is not None for lane in lanes):
         return []
     low = max(min(lane.road_s[0], lane.road_s[-1]) for lane in lanes)

@@ -83,6 +83,27 @@ class Least(NamedTuple):
         return measured(self.time, self.found)
 
 
+class LeastWith(NamedTuple):
+    """The least sample so far, and the vehicle that it is with."""
+
+    least: Least
+    slot: Int[Array, "*b"]  # of that vehicle, -1: none
+
+    @classmethod
+    def empty(cls) -> LeastWith:
+        """Of no samples."""
+        return cls(Least.empty(), jnp.int32(-1))
+
+    def add(self, x: Float[Array, ""], t: Float[Array, ""], where: Bool[Array, ""], slot: Array) -> LeastWith:
+        """One more sample at time `t` with a vehicle, if `where`."""
+        better = where & (~self.least.found | (x < self.least.value))
+        return LeastWith(self.least.add(x, t, where), jnp.where(better, slot, self.slot))
+
+    def other(self) -> Measured:
+        """The slot."""
+        return measured(self.slot.astype(self.least.value.dtype), self.least.found)
+
+
 class Episodes(NamedTuple):
     """Counts how often a condition began: between `ends` and the next `begins` it goes on.
 

@@ -230,12 +230,11 @@ class StepView:
         - it meets the ego on straight lines, and within `COURSE` s along the lanes and lane changes of both;
         - it does not close up calmly behind the ego: it would have to brake harder than `FIRM_BRAKING`.
         """
-        record, e = self.record, self.encounter
+        record = self.record
         leaving = record.changing[self.slot]
         along = record.meets - self.time
         along = jnp.where(self.touches | (self.ttc >= COURSE), 0, along)
-        behind = jnp.maximum(-e.x - reach(e)[0], 0)  # m, of the other's front to the ego's tail
-        calm = record.follows & (drac(behind, e.u, jnp.zeros_like(e.u)) <= FIRM_BRAKING)
+        calm = record.follows & self._calm(-1.0)
         counts = ((record.relevant | leaving) & (along < COURSE) & ~calm) | self.touches
         return jnp.where(self.apart & counts, greater(self.ttc, along), NONE)
 
@@ -262,14 +261,20 @@ class StepView:
         As `least_ttc`, but a vehicle that the ego closes up to from behind counts only if the ego must brake
         harder than `FIRM_BRAKING`.
         """
-        e = self.encounter
-        room = jnp.maximum(e.x - reach(e)[0], 0)  # m, of the ego's front to the other's tail
-        calm = self.record.leads & (drac(room, -e.u, jnp.zeros_like(e.u)) <= FIRM_BRAKING)
-        ttc = jnp.where(calm, NONE, self.ttc_on_course)
+        ttc = jnp.where(self.record.leads & self._calm(1.0), NONE, self.ttc_on_course)
         lane = jnp.where(drac(self.gap, self.v, self.v_leader) > FIRM_BRAKING, self.least_ttc_1d, NONE)
         other = jnp.argmin(ttc).astype(self.leader.dtype)
         least = jnp.min(ttc)
         return jnp.minimum(least, lane), jnp.where(lane < least, self.leader, other)
+
+    def _calm(self, side: float) -> Bool[Array, " N"]:
+        """Whether the rear one of two vehicles can brake calmly.
+
+        The other one is ahead of the ego (`side` 1) or behind it (-1). Calm is up to `FIRM_BRAKING`.
+        """
+        e = self.encounter
+        room = jnp.maximum(side * e.x - reach(e)[0], 0)  # m, from front to tail
+        return drac(room, -side * e.u, jnp.zeros_like(e.u)) <= FIRM_BRAKING
 
     # --- for metrics of one's own
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from jaxtyping import Array
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.base import Policy, PolicyLike, knows, policy_name, sighted
 from limsim_jax.traffic.command import Command
-from limsim_jax.traffic.ego import Trajectory
+from limsim_jax.traffic.ego import Control, Trajectory
 from limsim_jax.types import Config, State
 
 
@@ -97,21 +97,18 @@ def joined(parts: Sequence[tuple[Command, int]]) -> Command:
     commands = [command for command, _ in parts]
     trajectory = [c.trajectory for c in commands if c.trajectory is not None]
 
-    def rows(name: str, nothing: int) -> Array | None:
+    def rows(of: Callable[[Command], Array | None], nothing: int) -> Array | None:
         """A field of all commands, `nothing` where a command has none."""
-        found = [getattr(command, name) for command in commands]
+        found = [of(command) for command in commands]
         if all(x is None for x in found):
             return None
         dtype = next(x.dtype for x in found if x is not None)
         fill = [jnp.full(count, nothing, dtype) for _, count in parts]
         return jnp.concatenate([y if x is None else x for x, y in zip(found, fill, strict=True)])
 
-    control = None
-    if any(c.control is not None for c in commands):
-        given = next(c.control for c in commands if c.control is not None)
-        still = [jax.tree.map(lambda x: jnp.zeros(n, x.dtype), given) for _, n in parts]  # noqa: B023
-        each = [y if c.control is None else c.control for c, y in zip(commands, still, strict=True)]
-        control = jax.tree.map(lambda *x: jnp.concatenate(x), *each)
+    a = rows(lambda c: None if c.control is None else c.control.acceleration, 0)
+    steering = rows(lambda c: None if c.control is None else c.control.steering, 0)
+    control = None if a is None or steering is None else Control(acceleration=a, steering=steering)
     by_control = None
     if trajectory and control is not None:
         by_control = jnp.concatenate(
@@ -122,8 +119,8 @@ def joined(parts: Sequence[tuple[Command, int]]) -> Command:
         trajectory=_at_moments(trajectory[-1], parts) if trajectory else None,
         control=control,
         by_control=by_control,
-        meta=rows("meta", -1),
-        signal=rows("signal", 0),
+        meta=rows(lambda c: c.meta, -1),
+        signal=rows(lambda c: c.signal, 0),
         brake=jnp.stack(brake).any(0) if brake else None,
     )
 

@@ -51,7 +51,7 @@ from limsim_jax.sweeps.experiment import NO_POLICY, Bounds, ExperimentError, Exp
 from limsim_jax.sweeps.identity import describe, describe_program, is_foreign, policy_code, without_sources
 from limsim_jax.sweeps.moments import key_moments
 from limsim_jax.sweeps.reruns import CanBrake, Replay, Reruns
-from limsim_jax.sweeps.script import script_of, script_vehicles, with_zones
+from limsim_jax.sweeps.script import script_of, script_vehicles, share_done, with_zones
 from limsim_jax.sweeps.store import Outcome
 from limsim_jax.traffic.car_following import CarFollowing
 from limsim_jax.traffic.demand import Flow, sample_scenario
@@ -190,7 +190,7 @@ class Episodes:
             units = {"success": "1 if the criteria of the experiment are met"} | units
         units |= {total.name: total.meaning for total in TOTALS}
         if self._script is not None and self._script.actions is not None:
-            units[_BEGUN] = "share of the actions of the experiment that have begun"
+            units[_BEGUN] = "share of the actions of the experiment that have begun, lane changes started"
         return units
 
     def _refuse(self, field: str, message: str) -> NoReturn:
@@ -337,8 +337,9 @@ class Episodes:
         for column in TOTALS:
             counted = getattr(result.totals, column.name.removeprefix("traffic_"))
             found[column.name] = np.asarray(counted, float)
-        if result.state.script is not None:
-            found[_BEGUN] = np.isfinite(np.asarray(result.state.script.begun)).mean(-1)
+        progress = result.state.script
+        if progress is not None and self._script is not None and self._script.actions is not None:
+            found[_BEGUN] = share_done(self._script.actions, progress)
         each = max(self.egos, 1)
         metrics = {name: x.ravel() if x.ndim == 2 else np.repeat(x, each) for name, x in found.items()}
         if self.experiment.success:

@@ -26,7 +26,9 @@ def vehicles_of(where: str, tables: Sequence[PlacedTable]) -> tuple[Driver, Shap
     return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
 
-def placed(where: str, tables: Sequence[PlacedTable], shape: Shape, town: Map) -> dict[str, Any]:
+def placed(
+    where: str, tables: Sequence[PlacedTable], shape: Shape, town: Map, *, goes: bool = True
+) -> dict[str, Any]:
     """Lane, place and goal of vehicles: fields of `EgoStart`.
 
     Args:
@@ -34,6 +36,7 @@ def placed(where: str, tables: Sequence[PlacedTable], shape: Shape, town: Map) -
       tables: of the vehicles.
       shape: of their bodies.
       town: the map.
+      goes: whether they go anywhere; otherwise any goal will do.
 
     Raises:
       ExperimentError: a place or goal that the map does not have; one line.
@@ -43,9 +46,13 @@ def placed(where: str, tables: Sequence[PlacedTable], shape: Shape, town: Map) -
     for k, (table, length) in enumerate(zip(tables, shape.length.tolist(), strict=True)):
         field = _field(where, k, tables)
         lane, s = spot(field, table.start, table.lane, max(table.s, length), town)
-        lanes.append(rows[lane.id])
+        row = rows[lane.id]
+        lanes.append(row)
         places.append(max(s, length))  # the whole body is on its lane
-        goals.append(_goal(field, table.goal, lane, rows[lane.id], town))
+        if goes:
+            goals.append(_goal(field, table.goal, lane, row, town))
+        else:
+            goals.append(int(jnp.argmax(town.lanes.routes.reachable[row])))
     return {
         "lane": jnp.asarray(lanes, jnp.int32),
         "s": jnp.asarray(places, jnp.float32),

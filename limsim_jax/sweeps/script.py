@@ -9,17 +9,18 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from limsim_jax.geometry import box_separation
-from limsim_jax.maps.cut import close, cut
+from limsim_jax.maps.cut import SHORTEST, close, cut
 from limsim_jax.maps.lane_map import pose
 from limsim_jax.maps.map import Map
 from limsim_jax.maps.network import Lane, Network
 from limsim_jax.sweeps.experiment import ExperimentError, ExperimentFile
-from limsim_jax.sweeps.places import placed, spot, vehicles_of
+from limsim_jax.sweeps.places import placed, vehicles_of
 from limsim_jax.sweeps.script_file import ActionTable, ObstacleTable, VehicleTable, ZoneTable
 from limsim_jax.traffic.demand import EgoStart
-from limsim_jax.types import Actions, Order, Script, Zones
+from limsim_jax.types import Actions, Order, Progress, Script, Zones
 
 _NEVER_CHANGES = 1e9
 """m/s^2, `Driver.threshold` of a vehicle that keeps its lane."""
@@ -34,7 +35,7 @@ def with_zones(experiment: ExperimentFile, town: Map) -> Map:
     cuts: dict[tuple[str, int], set[float]] = {}
     for k, zone in enumerate(experiment.zone):
         for lane, low, high in _stretches(_field(experiment, k), zone, network):
-            if lane.junction is None:
+            if zone.s_from or zone.s_to is not None:
                 cuts.setdefault((lane.road, lane.section), set()).update((low, high))
     network = cut(network, cuts)
     closed = [
@@ -97,6 +98,9 @@ def zone_lanes(where: str, zone: ZoneTable, before: Network, after: Network) -> 
       zone: the table.
       before: the map as the file has it.
       after: the map that is cut.
+
+    Raises:
+      ExperimentError: a zone without any lane: it is too short; one line.
     """
     found = []
     for lane, low, high in _stretches(where, zone, before):
@@ -107,6 +111,11 @@ def zone_lanes(where: str, zone: ZoneTable, before: Network, after: Network) -> 
                 found.append(after.lanes[piece])
             number += 1
             piece = f"{lane.id}/{number}"
+    if not found:
+        raise ExperimentError(
+            f"{where}: from {zone.s_from:g} to {zone.s_to or math.inf:g} m there is no lane; a zone has "
+            f"{SHORTEST:g} m or more, outside junctions"
+        )
     return found
 
 
@@ -144,19 +153,7 @@ def _obstacles(name: str, tables: Sequence[ObstacleTable], town: Map) -> tuple:
     driver, shape = vehicles_of(f"{name}: obstacle", standing)
     size = {k: jnp.asarray([getattr(x, k) for x in tables], jnp.float32) for k in ("length", "width")}
     shape = replace(shape, **size)
-    rows, places, goals = [], [], []
-    for k, table in enumerate(tables):
-        field = f"{name}: obstacle" if len(tables) == 1 else f"{name}: obstacle.{k}"
-        lane, s = spot(field, table.start, table.lane, max(table.s, table.length), town)
-        row = town.lane_ids.index(lane.id)
-        rows.append(row)
-        places.append(max(s, table.length))
-        goals.append(int(jnp.argmax(town.lanes.routes.reachable[row])))
-    place = {
-        "lane": jnp.asarray(rows, jnp.int32),
-        "s": jnp.asarray(places, jnp.float32),
-        "goal": jnp.asarray(goals, jnp.int32),
-    }
+    place = placed(f"{name}: obstacle", standing, shape, town, goes=False)
     return driver, shape, jnp.zeros(len(tables), jnp.float32), place
 
 
@@ -218,6 +215,12 @@ def _actions(experiment: ExperimentFile, first: int) -> Actions | None:
         before=jnp.asarray(before, jnp.int32),
         **{name: jnp.asarray(x, jnp.float32) for name, x in floats.items()},
     )
+
+
+def share_done(actions: Actions, progress: Progress) -> NDArray[np.float64]:
+    """Share of the actions that have begun, `[W]`; a lane change once it has started."""
+    waits = (np.asarray(actions.order) == Order.CHANGE_LANE) & ~np.asarray(progress.made)
+    return (np.isfinite(np.asarray(progress.begun)) & ~waits).mean(-1)
 
 
 def _stands(obstacle: ObstacleTable) -> list[ActionTable]:

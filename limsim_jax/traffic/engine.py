@@ -59,6 +59,7 @@ from limsim_jax.traffic.script import (
     leaves,
     limits_with_grip,
     ordered_change,
+    speed_orders,
     with_grip,
     without_speed,
 )
@@ -390,12 +391,13 @@ def _step(
     Returns the state, metres travelled, whether vehicles have left, and whether they are off the road.
     """
     egos = state.egos
-    if actions is not None:
+    if actions is None:
+        a = accelerations(traffic.model, state, decision, x)
+    else:
         state = begin(config, lane_map, actions, state)
-        decision = without_speed(config, actions, state, decision)
-    a = accelerations(traffic.model, state, decision, x)
-    if actions is not None:
-        a = accelerate(config, actions, state, a)
+        orders = speed_orders(config, actions, state)
+        a = accelerations(traffic.model, state, without_speed(orders, decision), x)
+        a = accelerate(config, orders, state, a)
     if command.meta is not None:
         told = meta_acceleration(jnp.maximum(command.meta, 0), state, a)
         a = at_slots(egos, told, a, ~egos.free & (command.meta >= 0))

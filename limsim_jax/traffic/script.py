@@ -6,10 +6,11 @@ Conditions of actions are looked at in every physics step; lane changes start at
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose
 from limsim_jax.numerics import safe_norm
@@ -35,8 +36,7 @@ def no_progress(actions: Actions) -> Progress:
 @jax.named_scope("script")
 def begin(config: Config, lane_map: LaneMap, actions: Actions, state: State) -> State:
     """The state in which those actions have begun whose conditions hold now."""
-    if state.script is None:
-        return state
+    assert state.script is not None
     now, begun = config.time(state.step), state.script.begun
     first = actions.before < 0
     since = now - jnp.where(first, -jnp.inf, begun[actions.before])
@@ -86,30 +86,40 @@ def _at_slots(actions: Actions, which: Bool[Array, " A"], number: int) -> tuple[
     return mine.any(0), jnp.argmax(mine, 0)
 
 
-def without_speed(config: Config, actions: Actions, state: State, decision: Decision) -> Decision:
+class SpeedOrders(NamedTuple):
+    """What vehicles are told about their speed now, `[N]`."""
+
+    here: Bool[Array, " N"]  # whether anything
+    order: Int[Array, " N"]
+    value: Float[Array, " N"]
+    rate: Float[Array, " N"]  # m/s^2
+    careful: Bool[Array, " N"]
+
+
+def speed_orders(config: Config, actions: Actions, state: State) -> SpeedOrders:
+    """What vehicles are told about their speed now."""
+    here, k = _at_slots(actions, _ruling(config, actions, state), state.lane.shape[0])
+    return SpeedOrders(here, actions.order[k], actions.value[k], actions.rate[k], actions.careful[k])
+
+
+def without_speed(orders: SpeedOrders, decision: Decision) -> Decision:
     """The decision without the desired speeds of vehicles that are told theirs."""
-    if state.script is None:
-        return decision
-    told = _ruling(config, actions, state) & (actions.order == int(Order.SPEED))
-    here, _ = _at_slots(actions, told, state.lane.shape[0])
-    return decision._replace(v0=jnp.where(here, _NO_LIMIT, decision.v0))
+    speed = orders.here & (orders.order == int(Order.SPEED))
+    return decision._replace(v0=jnp.where(speed, _NO_LIMIT, decision.v0))
 
 
-def accelerate(config: Config, actions: Actions, state: State, a: Float[Array, " N"]) -> Float[Array, " N"]:
+def accelerate(
+    config: Config, orders: SpeedOrders, state: State, a: Float[Array, " N"]
+) -> Float[Array, " N"]:
     """Accelerations (m/s^2) of all vehicles, by order where there is one.
 
     Args:
       config: of the run.
-      actions: of the script.
+      orders: what vehicles are told.
       state: the world.
       a: m/s^2, of traffic without orders.
     """
-    if state.script is None:
-        return a
-    here, k = _at_slots(actions, _ruling(config, actions, state), state.lane.shape[0])
-    order, value, rate, careful = (
-        x[k] for x in (actions.order, actions.value, actions.rate, actions.careful)
-    )
+    here, order, value, rate, careful = orders
     driver = state.driver
     up, down = (jnp.where(rate > 0, rate, x) for x in (driver.a, driver.b))
     wanted = jnp.clip((value - state.v) / config.dt, -down, up)

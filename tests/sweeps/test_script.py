@@ -1,6 +1,7 @@
 """Vehicles, obstacles and zones of an experiment: what they do, against closed forms, and what is refused."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -8,6 +9,8 @@ from pydantic import ValidationError
 import limsim_jax as lj
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import ExperimentError, ExperimentFile, first_fault
+from limsim_jax.sweeps.script import share_done
+from limsim_jax.types import Actions, Order, Progress
 
 HOLD = {"speed": 20.0, "careful": False}
 
@@ -146,6 +149,20 @@ def test_other_traffic_keeps_away_from_vehicles_with_a_place():
         np.testing.assert_allclose(s[:, k], 150.0)
 
 
+def test_a_lane_change_that_waits_for_a_lane_is_not_done():
+    orders = [int(Order.BRAKE), int(Order.CHANGE_LANE), int(Order.CHANGE_LANE), int(Order.LEAVE)]
+    nothing = jnp.zeros(4)
+    actions = Actions(
+        slot=jnp.zeros(4, jnp.int32), order=jnp.array(orders), value=nothing, rate=nothing, duration=nothing,
+        careful=nothing > 0, at=nothing, within=nothing, travelled=nothing, after=nothing,
+        before=jnp.zeros(4, jnp.int32),
+    )  # fmt: skip
+    begun = np.array([[1.0, 2.0, 3.0, np.inf], [1.0, 2.0, 3.0, 4.0]])
+    made = np.array([[False, True, False, False], [False, True, True, False]])
+    found = share_done(actions, Progress(begun=jnp.asarray(begun), made=jnp.asarray(made)))
+    np.testing.assert_allclose(found, [0.5, 1.0])
+
+
 def _with(more):
     plain = {name: FILE[name] for name in ("name", "map", "horizon", "slots", "ego")}
     return plain | more
@@ -224,6 +241,9 @@ MISPLACED = {
     "a road that is not there": (zone(where="77", friction=0.5), "zone.0.where: no road or lane '77'"),
     "a zone beyond its road": (
         zone(where="1", speed_limit=9.0, s_to=9e3), "zone.0.s_to: 9000 m, but road '1' is only",
+    ),
+    "a zone too short to be one": (
+        zone(where="1", closed=True, s_from=700.0, s_to=702.0), "zone.0: from 700 to 702 m there is no lane",
     ),
     "a vehicle on a closed lane": (
         car(start="1_0_-6") | zone(where="1_0_-6", closed=True),

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.metrics.description import Description, Headline, Plot
 from limsim_jax.metrics.measure import Derived, Measure, Summary
-from limsim_jax.metrics.reductions import Episodes, Least, Measured, measured
+from limsim_jax.metrics.reductions import Episodes, Least, LeastWith, Measured, measured
 from limsim_jax.metrics.safety import (
     EXPOSED,
     NEAR_MISS,
@@ -33,13 +33,11 @@ _NO_LEADER = "No vehicle led the ego on its lane."
 class TtcCarry(NamedTuple):
     """Memory of `TimeToCollision`."""
 
-    both: Least
-    other: Int[Array, ""]  # slot
+    both: LeastWith
     lane: Least
     boxes: Least
     exposed: Float[Array, ""]  # s
-    urgent: Least
-    urgent_other: Int[Array, ""]  # slot
+    urgent: LeastWith
     near: Episodes
     near_contact: Bool[Array, ""]  # the near miss that goes on has become a contact
     near_contacts: Int[Array, ""]
@@ -116,13 +114,11 @@ class TimeToCollision(Measure):
         """Nothing met."""
         empty, no = Least.empty(), jnp.zeros((), bool)
         return TtcCarry(
-            both=empty,
-            other=jnp.int32(-1),
+            both=LeastWith.empty(),
             lane=empty,
             boxes=empty,
             exposed=jnp.zeros(()),
-            urgent=empty,
-            urgent_other=jnp.int32(-1),
+            urgent=LeastWith.empty(),
             near=Episodes.empty(),
             near_contact=no,
             near_contacts=jnp.zeros((), jnp.int32),
@@ -135,16 +131,12 @@ class TimeToCollision(Measure):
         near = carry.near.add(urgent < NEAR_MISS[0], urgent > NEAR_MISS[1])
         near_contact = near.inside & (carry.near_contact | derived.hit)
         begun = (near_contact & ~carry.near_contact).astype(jnp.int32)
-        both = carry.both.add(least, t, least < NONE)
-        most = carry.urgent.add(urgent, t, urgent < NEAR_MISS[0])
         return TtcCarry(
-            both=both,
-            other=jnp.where(_new(carry.both, both), step.least_ttc_other, carry.other),
+            both=carry.both.add(least, t, least < NONE, step.least_ttc_other),
             lane=carry.lane.add(step.least_ttc_1d, t, step.least_ttc_1d < NONE),
             boxes=carry.boxes.add(step.least_ttc_2d, t, step.least_ttc_2d < NONE),
             exposed=carry.exposed + jnp.where(step.drove & (least < EXPOSED), step.dt, 0),
-            urgent=most,
-            urgent_other=jnp.where(_new(carry.urgent, most), urgent_other, carry.urgent_other),
+            urgent=carry.urgent.add(urgent, t, urgent < NEAR_MISS[0], urgent_other),
             near=near,
             near_contact=near_contact,
             near_contacts=carry.near_contacts + begun,
@@ -152,32 +144,26 @@ class TimeToCollision(Measure):
 
     def result(self, carry: TtcCarry, summary: Summary) -> dict[str, Measured]:
         """All columns."""
-        other, urgent_other = (x.astype(summary.duration.dtype) for x in (carry.other, carry.urgent_other))
+        both, urgent = carry.both, carry.urgent
         return {
-            "min_ttc": carry.both.result(),
-            "min_ttc_time": carry.both.when(),
-            "min_ttc_other": measured(other, carry.both.found),
+            "min_ttc": both.least.result(),
+            "min_ttc_time": both.least.when(),
+            "min_ttc_other": both.other(),
             "min_ttc_1d": carry.lane.result(),
             "min_ttc_2d": carry.boxes.result(),
             "ttc_exposed": measured(carry.exposed, summary.started),
-            "near_miss_ttc": carry.urgent.result(),
-            "near_miss_time": carry.urgent.when(),
-            "near_miss_other": measured(urgent_other, carry.urgent.found),
+            "near_miss_ttc": urgent.least.result(),
+            "near_miss_time": urgent.least.when(),
+            "near_miss_other": urgent.other(),
             "near_misses": summary.number(carry.near.number - carry.near_contacts),
         }
-
-
-def _new(before: Least, after: Least) -> Bool[Array, ""]:
-    """Whether a step has brought a new least value."""
-    return after.found & (~before.found | (after.value < before.value))
 
 
 class FollowingCarry(NamedTuple):
     """Memory of `Following`."""
 
     thw: Least
-    drac: Least  # of the negative
-    other: Int[Array, ""]  # slot of that leader
+    drac: LeastWith  # of the negative
 
 
 class Following(Measure):
@@ -213,26 +199,25 @@ class Following(Measure):
 
     def init(self, slots: int, zones: int) -> FollowingCarry:
         """No leader yet."""
-        return FollowingCarry(Least.empty(), Least.empty(), jnp.int32(-1))
+        return FollowingCarry(Least.empty(), LeastWith.empty())
 
     def update(self, carry: FollowingCarry, step: StepView, derived: Derived) -> FollowingCarry:
         """Add headway and braking of this step."""
         t, thw = step.time, time_headway(step.gap, step.v)
-        hardest = carry.drac.add(-drac(step.gap, step.v, step.v_leader), t, step.has_leader)
+        asked = drac(step.gap, step.v, step.v_leader)
         return FollowingCarry(
             thw=carry.thw.add(thw, t, thw < NONE),
-            drac=hardest,
-            other=jnp.where(_new(carry.drac, hardest), step.leader, carry.other),
+            drac=carry.drac.add(-asked, t, step.has_leader, step.leader),
         )
 
     def result(self, carry: FollowingCarry, summary: Summary) -> dict[str, Measured]:
         """All columns."""
-        least = carry.drac.result()
+        least = carry.drac.least.result()
         return {
             "min_thw": carry.thw.result(),
             "max_drac": measured(-least.value, least.valid),
-            "max_drac_time": carry.drac.when(),
-            "max_drac_other": measured(carry.other.astype(summary.duration.dtype), least.valid),
+            "max_drac_time": carry.drac.least.when(),
+            "max_drac_other": carry.drac.other(),
         }
 
 
