@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,10 +22,14 @@ class Map:
     Attributes:
       network: what the file says, float64.
       extra_goals: ids of lanes that are goals beside the ways out of the map.
+      no_exits: ids of lanes that are no ways out, though they end: at a road block.
+      no_entries: ids of lanes that are no ways in, though they begin: behind a road block.
     """
 
     network: Network
     extra_goals: tuple[str, ...] = field(default=())
+    no_exits: frozenset[str] = field(default=frozenset())
+    no_entries: frozenset[str] = field(default=frozenset())
 
     @property
     def name(self) -> str:
@@ -50,19 +54,21 @@ class Map:
         """Where vehicles can go: name to the ids of the lanes there, in the order of goal indices."""
         from limsim_jax.maps.routing import default_goals
 
-        return default_goals(self.network) | {lane: (lane,) for lane in self.extra_goals}
+        return _without(default_goals(self.network), self.no_exits) | {
+            lane: (lane,) for lane in self.extra_goals
+        }
 
     @cached_property
     def origins(self) -> dict[str, tuple[str, ...]]:
         """Where vehicles can come in: name to the ids of the lanes there, from right to left."""
         from limsim_jax.maps.origins import origins
 
-        return origins(self.network)
+        return _without(origins(self.network), self.no_entries)
 
     @cached_property
     def lanes(self) -> LaneMap:
         """The arrays on the device: look-ups such as `pose` and `to_frenet` take them."""
-        return build_lane_map(self.network, self.goals if self.extra_goals else None)
+        return build_lane_map(self.network, self.goals if self.extra_goals or self.no_exits else None)
 
     @cached_property
     def lane_ids(self) -> list[str]:
@@ -74,7 +80,7 @@ class Map:
     def with_goals(self, lanes: Iterable[str]) -> Map:
         """The map in which these lanes are goals, too; names of goals and unknown lanes are passed over."""
         new = [x for x in dict.fromkeys(lanes) if x not in self.goals and x in self.network.lanes]
-        return type(self)(self.network, (*self.extra_goals, *new)) if new else self
+        return replace(self, extra_goals=(*self.extra_goals, *new)) if new else self
 
     def __repr__(self) -> str:
         lanes = list(self.network.drivable_lanes())
@@ -83,6 +89,12 @@ class Map:
             f"Map '{self.name}': {len(lanes)} drivable lanes, {km:.2f} km, {len(self.network.junctions)} "
             f"junctions, origins {_listed(self.origins)}, goals {_listed(self.goals)}"
         )
+
+
+def _without(ways: Mapping[str, tuple[str, ...]], barred: frozenset[str]) -> dict[str, tuple[str, ...]]:
+    """Ways in or out without some lanes."""
+    found = {name: tuple(x for x in lanes if x not in barred) for name, lanes in ways.items()}
+    return {name: lanes for name, lanes in found.items() if lanes}
 
 
 def _listed(names: Iterable[str], most: int = 8) -> str:

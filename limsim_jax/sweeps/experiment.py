@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     Field,
     ValidationError,
     field_serializer,
@@ -30,6 +31,7 @@ from limsim_jax.sweeps.script_file import (
     Table,
     VehicleTable,
     ZoneTable,
+    one_or_more,
 )
 from limsim_jax.traffic.collision import AfterCollision
 
@@ -76,7 +78,7 @@ class TrafficTable(Table):
     """On the road at the start, the ego not counted unless its start is random."""
     density: NotNegative = 0.0
     """Instead of that, vehicles per km of lane at the start."""
-    flow: list[FlowTable] = Field(default_factory=list)
+    flow: Annotated[list[FlowTable], BeforeValidator(one_or_more)] = Field(default_factory=list)
     mix: dict[str, NotNegative] | None = None
     """Shares of vehicle classes."""
     drivers: str | None = None
@@ -150,10 +152,11 @@ class ExperimentFile(Table):
     traffic: TrafficTable = TrafficTable()
     ego: tuple[EgoTable, ...] = (EgoTable(),)
     """The vehicle under test, several as `[[ego]]`, or none: `ego = false`."""
-    vehicle: list[VehicleTable] = Field(default_factory=list)
+    vehicle: Annotated[list[VehicleTable], BeforeValidator(one_or_more)] = Field(default_factory=list)
     """Vehicles with a place, and actions, of their own."""
-    obstacle: list[ObstacleTable] = Field(default_factory=list)
-    zone: list[ZoneTable] = Field(default_factory=list)
+    obstacle: Annotated[list[ObstacleTable], BeforeValidator(one_or_more)] = Field(default_factory=list)
+    """Bodies that stand on lanes."""
+    zone: Annotated[list[ZoneTable], BeforeValidator(one_or_more)] = Field(default_factory=list)
     """Closed lanes, and speed limits and friction that differ from the map's."""
     success: dict[str, bool | int | float | Bounds] = Field(default_factory=dict)
     """What counts as success: metrics with the value or the bounds they must keep; absent: to arrive

@@ -12,7 +12,6 @@ from limsim_jax.maps.cut import piece_at
 from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.map import Map
 from limsim_jax.maps.network import Lane
-from limsim_jax.maps.origins import origins
 from limsim_jax.sweeps.experiment import ExperimentError
 from limsim_jax.sweeps.script_file import PlacedTable
 from limsim_jax.traffic.vehicles import sample_vehicles, uniform_population
@@ -100,7 +99,7 @@ def spot(where: str, start: str, lane: int, s: float, town: Map) -> tuple[Lane, 
 
 
 def _start_lane(where: str, start: str, number: int, town: Map) -> str:
-    network, known = town.network, origins(town.network)
+    network, known = town.network, town.origins
     if start in network.lanes:
         lanes = [start]
     elif start in known:

@@ -44,11 +44,18 @@ def with_zones(experiment: ExperimentFile, town: Map) -> Map:
         if zone.closed
         for lane in zone_lanes(_field(experiment, k), zone, town.network, network)
     ]
-    if closed:
-        network = close(network, closed)
-        if not any(True for _ in network.drivable_lanes()):
-            raise ExperimentError(f"{experiment.name}: zone: no lane of the map is left open")
-    return town if network is town.network else Map(network, town.extra_goals)
+    if network is town.network and not closed:
+        return town
+    shut = [network.lanes[name] for name in closed]
+    network = close(network, closed)
+    if not any(True for _ in network.drivable_lanes()):
+        raise ExperimentError(f"{experiment.name}: zone: no lane of the map is left open")
+    return replace(
+        town,
+        network=network,
+        no_exits=frozenset(x for lane in shut for x in lane.predecessors),
+        no_entries=frozenset(x for lane in shut for x in lane.successors),
+    )
 
 
 def _field(experiment: ExperimentFile, number: int) -> str:

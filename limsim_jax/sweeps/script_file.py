@@ -5,12 +5,18 @@ They are `[[vehicle]]` with `[[vehicle.action]]`, `[[obstacle]]` and `[[zone]]`.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+def one_or_more(found: Any) -> Any:
+    """`[vehicle]` is one of what `[[vehicle]]` is a list of."""
+    return [found] if isinstance(found, Mapping | BaseModel) else found
 
 
 class Table(BaseModel):
@@ -95,7 +101,7 @@ class VehicleTable(PlacedTable):
     """A way out of the map or a lane id; absent: the only one that it can reach."""
     keeps_lane: bool = False
     """Whether it changes lanes by order only."""
-    action: list[ActionTable] = Field(default_factory=list)
+    action: Annotated[list[ActionTable], BeforeValidator(one_or_more)] = Field(default_factory=list)
 
 
 class ObstacleTable(Table):

@@ -261,6 +261,24 @@ def test_what_does_not_fit_the_map_is_one_line(case):
     assert f"script: {message}" in str(raised.value) and "\n" not in str(raised.value)
 
 
+def test_one_table_is_a_list_of_one():
+    one = {"start": "1-", "s": 100.0, "action": {"at": 3.0, "brake": 5.0}}
+    file = ExperimentFile.model_validate(_with({"vehicle": one, "zone": {"friction": 0.3}}))
+    assert [x.action[0].brake for x in file.vehicle] == [5.0] and file.zone[0].friction == 0.3
+
+
+@pytest.mark.engine
+def test_a_road_block_is_no_way_in_or_out():
+    blocked = {"where": "1", "s_from": 400.0, "s_to": 500.0, "closed": True}
+    with pytest.raises(ExperimentError, match=r"'2-' cannot be reached from lane '.*'; .* to nowhere"):
+        Episodes(ExperimentFile.model_validate(_with({"zone": [blocked]})))
+    experiment = ExperimentFile.model_validate(
+        _with({"ego": False, "traffic": {"vehicles": 5}, "zone": [blocked]})
+    )
+    town = Episodes(experiment).town
+    assert set(town.goals) == {"1+", "2-"} and set(town.origins) == {"1-", "2+"}
+
+
 @pytest.mark.engine
 def test_a_speed_in_km_per_hour_is_doubted():
     with pytest.warns(UserWarning, match=r"vehicle\.0\.action\.0\.speed: 120 m/s, but the highest limit"):
