@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,4 +67,4 @@ def load_map(source: str | Path | Network | _map.Map, *, cache: bool = True) -> 
       MapError: one line with file, line, element and reason.
     """
     found = _map.load_map(source, cache=cache)
-    return found if isinstance(found, Map) else Map(found.network, found.extra_goals)
+    return found if isinstance(found, Map) else Map(**{x.name: getattr(found, x.name) for x in fields(found)})

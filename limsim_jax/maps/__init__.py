@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -52,6 +52,7 @@ def read_network(path: str | Path, *, cache: bool = True) -> Network:
 def build_lane_map(
     network: Network,
     goals: Goals | None = None,
+    routes: Mapping[str, Sequence[str]] | None = None,
     *,
     report: ImportReport | None = None,
     cache: bool = True,
@@ -67,12 +68,12 @@ def build_lane_map(
 
     notes = ImportReport()
     identity = _loaded.get(network) if cache else None
-    name = _cache.key("lanes", *(identity or ()), _spell(goals))
+    name = _cache.key("lanes", *(identity or ()), _spell(goals), repr(routes or None))
     match _cache.load(name) if identity else None:
         case (rasterise.LaneMap() as arrays, ImportReport() as notes):
             built = jax.device_put(arrays)
         case _:
-            built = rasterise.build_lane_map(network, goals, report=notes)
+            built = rasterise.build_lane_map(network, goals, routes, report=notes)
             if identity:
                 _cache.store(name, (jax.tree.map(np.asarray, built), notes))
     if report is not None:

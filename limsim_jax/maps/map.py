@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,12 +22,14 @@ class Map:
     Attributes:
       network: what the file says, float64.
       extra_goals: ids of lanes that are goals beside the ways out of the map.
+      routes: lists of roads, each a goal as well: the end of its last road, by this way.
       no_exits: ids of lanes that are no ways out, though they end: at a road block.
       no_entries: ids of lanes that are no ways in, though they begin: behind a road block.
     """
 
     network: Network
     extra_goals: tuple[str, ...] = field(default=())
+    routes: tuple[tuple[str, ...], ...] = field(default=())
     no_exits: frozenset[str] = field(default=frozenset())
     no_entries: frozenset[str] = field(default=frozenset())
 
@@ -50,13 +52,20 @@ class Map:
         return self.network.report
 
     @cached_property
-    def goals(self) -> dict[str, tuple[str, ...]]:
-        """Where vehicles can go: name to the ids of the lanes there, in the order of goal indices."""
+    def exits(self) -> dict[str, tuple[str, ...]]:
+        """The ways out of the map: name to the ids of the lanes there."""
         from limsim_jax.maps.routing import default_goals
 
-        return _without(default_goals(self.network), self.no_exits) | {
-            lane: (lane,) for lane in self.extra_goals
-        }
+        return _without(default_goals(self.network), self.no_exits)
+
+    @cached_property
+    def goals(self) -> dict[str, tuple[str, ...]]:
+        """Where vehicles can go: name to the ids of the lanes there, in the order of goal indices."""
+        from limsim_jax.maps.routing import last_lanes
+
+        lanes = {lane: (lane,) for lane in self.extra_goals}
+        routes = {route_name(roads): last_lanes(self.network, roads[-1]) for roads in self.routes}
+        return self.exits | lanes | routes
 
     @cached_property
     def origins(self) -> dict[str, tuple[str, ...]]:
@@ -68,7 +77,9 @@ class Map:
     @cached_property
     def lanes(self) -> LaneMap:
         """The arrays on the device: look-ups such as `pose` and `to_frenet` take them."""
-        return build_lane_map(self.network, self.goals if self.extra_goals or self.no_exits else None)
+        plain = not (self.extra_goals or self.no_exits or self.routes)
+        routes = {route_name(roads): roads for roads in self.routes}
+        return build_lane_map(self.network, None if plain else self.goals, routes)
 
     @cached_property
     def lane_ids(self) -> list[str]:
@@ -77,10 +88,15 @@ class Map:
 
         return list(lane_ids(self.network))
 
-    def with_goals(self, lanes: Iterable[str]) -> Map:
-        """The map in which these lanes are goals, too; names of goals and unknown lanes are passed over."""
+    def with_goals(self, lanes: Iterable[str], routes: Iterable[Sequence[str]] = ()) -> Map:
+        """The map in which these lanes and routes are goals, too.
+
+        Names of goals and unknown lanes are passed over."""
         new = [x for x in dict.fromkeys(lanes) if x not in self.goals and x in self.network.lanes]
-        return replace(self, extra_goals=(*self.extra_goals, *new)) if new else self
+        ways = [x for x in dict.fromkeys(map(tuple, routes)) if x not in self.routes]
+        if not new and not ways:
+            return self
+        return replace(self, extra_goals=(*self.extra_goals, *new), routes=(*self.routes, *ways))
 
     def __repr__(self) -> str:
         lanes = list(self.network.drivable_lanes())
@@ -89,6 +105,11 @@ class Map:
             f"Map '{self.name}': {len(lanes)} drivable lanes, {km:.2f} km, {len(self.network.junctions)} "
             f"junctions, origins {_listed(self.origins)}, goals {_listed(self.goals)}"
         )
+
+
+def route_name(roads: Sequence[str]) -> str:
+    """The name of the goal that a route is."""
+    return " > ".join(roads)
 
 
 def _without(ways: Mapping[str, tuple[str, ...]], barred: frozenset[str]) -> dict[str, tuple[str, ...]]:

@@ -7,7 +7,7 @@ intervals that stay within `TOLERANCE` of the lane of the network. All tables ar
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -81,7 +81,11 @@ _LEAST = {  # least sizes of tables, so that all small maps have the same shapes
 
 
 def build_lane_map(
-    network: Network, goals: Goals | None = None, *, report: ImportReport | None = None
+    network: Network,
+    goals: Goals | None = None,
+    routes: Mapping[str, Sequence[str]] | None = None,
+    *,
+    report: ImportReport | None = None,
 ) -> LaneMap:
     """Turn a network into arrays: lanes, conflicts, routes and signals.
 
@@ -89,6 +93,7 @@ def build_lane_map(
         network: the map.
         goals: lane ids of each goal of `routes`, in the order of its columns or by name; default: the
             ways out of the map, see `routing.default_goals`.
+        routes: the roads to be driven, of goals by name whose way is prescribed.
         report: receives a note for every lane that misses `TOLERANCE` at the least interval length.
 
     Raises:
@@ -143,7 +148,9 @@ def build_lane_map(
         **_grid(raster, rows),
     }
     sight = max(_lanes_in_sight(lanes, lane_rows(network)), _LEAST["sight"])
-    lane_map = LaneMap(**arrays, **_rule_tables(network, goals, num_lanes), lanes_in_sight=sight)
+    lane_map = LaneMap(
+        **arrays, **_rule_tables(network, goals, routes or {}, num_lanes), lanes_in_sight=sight
+    )
     return jax.tree.map(lambda array: jnp.asarray(_device_type(array)), lane_map)
 
 
@@ -181,11 +188,13 @@ def _side_step(before: Lane, after: Lane) -> float:
     return abs(float(off[1] * np.cos(heading) - off[0] * np.sin(heading)))
 
 
-def _rule_tables(network: Network, goals: Goals | None, num_lanes: int) -> dict[str, Any]:
+def _rule_tables(
+    network: Network, goals: Goals, prescribed: Mapping[str, Sequence[str]], num_lanes: int
+) -> dict[str, Any]:
     """Conflicts, routes and signals, padded to buckets."""
     rows = lane_rows(network)
     conflicts = build_conflicts(network, rows)
-    routes = build_routes(network, rows, goals)
+    routes = build_routes(network, rows, goals, prescribed=prescribed)
     signals = build_signals(network, rows)
     (connectors, foes), (_, num_goals) = conflicts.foe.shape, routes.distance.shape
     programs, phases, links = signals.state.shape

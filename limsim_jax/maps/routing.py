@@ -68,11 +68,22 @@ def default_goals(network: Network) -> dict[str, tuple[str, ...]]:
     return goals
 
 
+def last_lanes(network: Network, road: str) -> tuple[str, ...]:
+    """Ids of the drivable lanes of a road with no successor on the same road."""
+    lanes = network.lanes
+    return tuple(
+        lane.id
+        for lane in network.drivable_lanes()
+        if lane.road == road and all(lanes[x].road != road for x in lane.successors if x in lanes)
+    )
+
+
 def build_routes(
     network: Network,
     rows: Mapping[str, int],
     goals: Sequence[Sequence[str]] | Mapping[str, Sequence[str]] | None = None,
     *,
+    prescribed: Mapping[str, Sequence[str]] | None = None,
     vehicle_class: str | None = None,
     change_penalty: float = CHANGE_PENALTY,
     short_penalty: float = SHORT_PENALTY,
@@ -85,6 +96,7 @@ def build_routes(
         rows: Row of every drivable lane (`lane_map.lane_rows`).
         goals: Groups of lane ids; a goal is reached at the end of any lane of its group. Default:
             `default_goals`.
+        prescribed: By the name of a goal, all roads on the way to it: see `build_fixed_routes`.
         vehicle_class: Use only lanes that this class may use. Default: all drivable lanes.
         change_penalty: Cost of one lane change, m.
         short_penalty: Cost (m) that is added for a change on a lane of no length. It falls to nothing at
@@ -105,7 +117,16 @@ def build_routes(
                 raise MapError(_no_such_lane(network, name), file=network.source, element=f"goal {name!r}")
     graph = _LaneGraph(network, rows, vehicle_class)
     columns = [[rows[name] for name in group] for group in groups]
-    return graph.solve(columns, change_penalty, tolerance, short_penalty=short_penalty)
+    table = graph.solve(columns, change_penalty, tolerance, short_penalty=short_penalty)
+    for column, name in enumerate(goals if isinstance(goals, Mapping) and prescribed else ()):
+        if name in prescribed:
+            way = build_fixed_routes(
+                network, rows, [prescribed[name]], vehicle_class=vehicle_class,
+                change_penalty=change_penalty, tolerance=tolerance,
+            )  # fmt: skip
+            for field, values in vars(way).items():
+                vars(table)[field][:, column] = values[:, 0]
+    return table
 
 
 def build_fixed_routes(
@@ -219,17 +240,8 @@ class _LaneGraph:
 
     def ends(self, road: str) -> list[Lane]:
         """Lanes of a road with no successor on the same road."""
-        return [
-            lane
-            for lane in self.lanes
-            if lane.road == road
-            and lane.id in self.usable
-            and all(
-                self.network.lanes[name].road != road
-                for name in lane.successors
-                if name in self.network.lanes
-            )
-        ]
+        last = last_lanes(self.network, road)
+        return [lane for lane in self.lanes if lane.id in last and lane.id in self.usable]
 
     def along(self, roads: Sequence[str]) -> NDArray[np.bool_]:
         """Which of the links ahead belong to a route over these roads: a mask over `ahead`."""

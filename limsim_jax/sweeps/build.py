@@ -109,7 +109,7 @@ def _own(name: str, where: str) -> Callable[..., PolicyLike]:
 
 
 def map_of(experiment: ExperimentFile, town: Map | None = None) -> Map:
-    """The map, with every lane that is named as a goal."""
+    """The map, with every lane and route that is named as a goal."""
     if town is None:
         try:
             town = load_map(bundled_maps().get(experiment.map, experiment.map))
@@ -117,10 +117,11 @@ def map_of(experiment: ExperimentFile, town: Map | None = None) -> Map:
             known = ", ".join(bundled_maps())
             hint = "" if os.path.exists(experiment.map) else f"; bundled maps are {known}"
             raise ExperimentError(f"{experiment.name}: map: {error}{hint}") from None
-    wanted = [x.goal for x in (*experiment.ego, *experiment.vehicle) if x.goal]
+    named = *experiment.ego, *experiment.vehicle
+    wanted = [x.goal for x in named if x.goal]
     for flow in experiment.traffic.flow:
         wanted += [flow.goal] if isinstance(flow.goal, str) else list(flow.goal or ())
-    return town.with_goals(wanted)
+    return town.with_goals(wanted, [x.route for x in named if x.route])
 
 
 def egos_of(experiment: ExperimentFile, town: Map, policy: PolicyLike) -> EgoStart | None:
@@ -199,7 +200,7 @@ def demand_of(
         return build_demand(
             town.network, town.lanes, town.goals, flows_of(experiment, town), population,
             horizon=experiment.horizon, density=traffic.density, vehicles=traffic.vehicles,
-            egos=egos, placed=placed,
+            egos=egos, placed=placed, common=town.exits,
         )  # fmt: skip
     except ValueError as error:
         raise ExperimentError(f"{experiment.name}: traffic: {error}") from None

@@ -50,6 +50,7 @@ from limsim_jax.sweeps.build import (
 from limsim_jax.sweeps.experiment import NO_POLICY, Bounds, ExperimentError, ExperimentFile
 from limsim_jax.sweeps.identity import describe, describe_program, is_foreign, policy_code, without_sources
 from limsim_jax.sweeps.moments import key_moments
+from limsim_jax.sweeps.places import check_routes
 from limsim_jax.sweeps.reruns import CanBrake, Replay, Reruns
 from limsim_jax.sweeps.script import script_of, script_vehicles, share_done, with_zones
 from limsim_jax.sweeps.store import Outcome
@@ -112,6 +113,7 @@ class Episodes:
             self._policy = with_view(experiment.ego[0], policy)
         self._as_read = map_of(experiment, town)
         self.town = with_zones(experiment, self._as_read)
+        check_routes(experiment, self.town)
         self._egos = egos_of(experiment, self.town, self._policy)
         self._placed = script_vehicles(experiment, self.town, self._egos)
         self._script = script_of(experiment, self._as_read.network, self.town, self.egos)

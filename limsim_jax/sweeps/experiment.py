@@ -112,11 +112,10 @@ class EgoTable(PlacedTable):
 
     @model_validator(mode="after")
     def _goal_belongs_to_start(self) -> EgoTable:
-        if (self.start == "random") != (self.goal is None):
+        goes = self.goal is not None or bool(self.route)
+        if (self.start == "random") == goes:
             raise ValueError(
-                "a goal is missing"
-                if self.goal is None
-                else "an ego with a random start has no goal of its own"
+                "an ego with a random start has no goal of its own" if goes else "a goal is missing"
             )
         return self
 

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 
 from limsim_jax.maps.cut import piece_at
 from limsim_jax.maps.lane_map import lane_rows
-from limsim_jax.maps.map import Map
-from limsim_jax.maps.network import Lane
-from limsim_jax.sweeps.experiment import ExperimentError
+from limsim_jax.maps.map import Map, route_name
+from limsim_jax.maps.network import Lane, MapError
+from limsim_jax.maps.routing import build_fixed_routes
+from limsim_jax.sweeps.experiment import ExperimentError, ExperimentFile
 from limsim_jax.sweeps.script_file import PlacedTable
 from limsim_jax.traffic.vehicles import sample_vehicles, uniform_population
 from limsim_jax.types import Driver, Shape
@@ -49,7 +50,8 @@ def placed(
         lanes.append(row)
         places.append(max(s, length))  # the whole body is on its lane
         if goes:
-            goals.append(_goal(field, table.goal, lane, row, town))
+            name = _route(field, table.route, lane) if table.route else table.goal
+            goals.append(_goal(field, name, lane, row, town))
         else:
             goals.append(int(jnp.argmax(town.lanes.routes.reachable[row])))
     return {
@@ -126,6 +128,29 @@ def _start_lane(where: str, start: str, number: int, town: Map) -> str:
     if network.lanes[ordered[number]].junction is not None:
         raise ExperimentError(f"{where}.start: lane '{ordered[number]}' is no lane to start on")
     return ordered[number]
+
+
+def check_routes(experiment: ExperimentFile, town: Map) -> None:
+    """Raise `ExperimentError` where a route cannot be driven on the map; one line."""
+    rows = lane_rows(town.network)
+    for name, tables in ("ego", experiment.ego), ("vehicle", experiment.vehicle):
+        for k, table in enumerate(tables):
+            where = f"{_field(f'{experiment.name}: {name}', k, tables)}.route"
+            twice = [road for road in table.route if table.route.count(road) > 1]
+            if twice:
+                raise ExperimentError(f"{where}: visits road '{twice[0]}' twice; once is possible")
+            try:
+                build_fixed_routes(town.network, rows, [table.route] if table.route else [])
+            except MapError as error:
+                raise ExperimentError(f"{where}: {error.reason}") from None
+
+
+def _route(where: str, roads: Sequence[str], lane: Lane) -> str:
+    if lane.road != roads[0]:
+        raise ExperimentError(
+            f"{where}.route: begins with road '{roads[0]}', but the vehicle starts on road '{lane.road}'"
+        )
+    return route_name(roads)
 
 
 def _goal(where: str, goal: str | None, lane: Lane, row: int, town: Map) -> int:

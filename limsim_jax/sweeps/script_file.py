@@ -6,7 +6,7 @@ They are `[[vehicle]]` with `[[vehicle.action]]`, `[[obstacle]]` and `[[zone]]`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
@@ -38,10 +38,18 @@ class PlacedTable(Table):
     """m/s; absent: as fast as road and leader allow."""
     goal: str | None = None
     """Where it goes: a way out of the map or a lane id."""
+    route: list[str] = Field(default_factory=list)
+    """Instead of a goal: all roads on its way outside junctions, from where it starts."""
     vehicle: str = "car"
     """Its class."""
     driver: dict[str, float] = Field(default_factory=dict)
     """Fields of `types.Driver` that differ from those of a typical driver."""
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if self.goal is not None and self.route:
+            raise ValueError("goal or route, not both; a route ends at the end of its last road")
+        return self
 
 
 _KINDS = "brake", "stop", "speed", "change_lane", "leave"

@@ -181,6 +181,11 @@ def zone(**more):
 
 
 WRONG = {
+    "two ways": (car(goal="2-", route=["1"]), "goal or route, not both"),
+    "a route from anywhere": (
+        {"ego": {"route": ["1"]}},
+        "ego: an ego with a random start has no goal of its own",
+    ),
     "a negative speed": (car(v=-3.0), "vehicle.0.v: Input should be greater than or equal to 0, not -3.0"),
     "no number as speed": (car(v=float("nan")), "vehicle.0.v: Input should be"),
     "a field that is not there": (car(speed=3.0), "vehicle.0.speed: no such field; known are start, lane"),
@@ -227,6 +232,15 @@ def test_what_is_wrong_with_a_table_is_one_line(case):
 
 
 MISPLACED = {
+    "a route from another road": (
+        car(route=["2"]), "vehicle.route: begins with road '2', but the vehicle starts on road '1'",
+    ),
+    "a route to nowhere": (
+        {"map": "intersection", "ego": False, "vehicle": [{"start": "1", "route": ["1", "3"]}]},
+        "vehicle.route: no lane from road '1' leads to '3' and on to '3'",
+    ),
+    "a route over no road": (car(route=["1", "9"]), "vehicle.route: no road '9'"),
+    "a route in a circle": (car(route=["1", "2", "1"]), "vehicle.route: visits road '1' twice; once is"),
     "an origin that is not there": (car(start="9-"), "vehicle.start: no origin, road or lane '9-'"),
     "a place beyond the lane": (car(s=9e3), "vehicle.s: 9000 m, but lane '1_0_-6' is only 1531.6 m long"),
     "a lane too many": (car(lane=9), "vehicle.lane: 9, but '1-' has lanes 0 to 3"),
@@ -265,6 +279,47 @@ def test_one_table_is_a_list_of_one():
     one = {"start": "1-", "s": 100.0, "action": {"at": 3.0, "brake": 5.0}}
     file = ExperimentFile.model_validate(_with({"vehicle": one, "zone": {"friction": 0.3}}))
     assert [x.action[0].brake for x in file.vehicle] == [5.0] and file.zone[0].friction == 0.3
+
+
+@pytest.mark.engine
+def test_a_route_prescribes_the_way_and_leaves_traffic_alone():
+    way = ["5", "4", "10", "11", "12", "13", "3", "2"]
+    plain = {
+        "name": "way",
+        "map": "long_route",
+        "horizon": 60.0,
+        "slots": 16,
+        "traffic": {"flow": [{"rate": 300.0}]},
+    }
+    named = {
+        "ego": {"start": "5-", "route": way},
+        "vehicle": [{"start": "5-", "lane": 1, "goal": "2"}, {"start": "1", "goal": "4_0_-2"}],
+    }
+    episodes = Episodes(ExperimentFile.model_validate(plain | named))
+    names = list(episodes.town.goals)
+    assert driven(episodes, "5_0_-2", names.index(" > ".join(way))) == way
+    assert driven(episodes, "5_0_-2", names.index("2")) == ["5", "2"]
+    # traffic has the destinations that it has without them
+    before = Episodes(ExperimentFile.model_validate(plain | {"ego": False}))._demand
+    np.testing.assert_array_equal(episodes._demand.goals, before.goals)
+
+
+def driven(episodes, lane, goal):
+    """The roads from a lane to a goal by the tables, without the connectors of junctions."""
+    lanes, routes = episodes.network.lanes, episodes.lane_map.routes
+    ids, found = episodes.town.lane_ids, []
+    while lane is not None:
+        if lanes[lane].junction is None and lanes[lane].road not in found:
+            found.append(lanes[lane].road)
+        row = ids.index(lane)
+        following, aside = int(routes.next_lane[row, goal]), int(routes.lanes_to_go[row, goal])
+        if routes.is_goal[row, goal]:
+            lane = None
+        elif following >= 0:
+            lane = ids[following]
+        else:
+            lane = lanes[lane].left if aside > 0 else lanes[lane].right
+    return found
 
 
 @pytest.mark.engine

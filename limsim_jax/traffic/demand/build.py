@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -43,6 +43,7 @@ def build_demand(
     vehicles: int | None = None,
     egos: EgoStart | None = None,
     placed: EgoStart | None = None,
+    common: Collection[str] | None = None,
 ) -> Demand:
     """Check flows and density, and lay them out for the device.
 
@@ -58,6 +59,7 @@ def build_demand(
       vehicles: instead of that, how many there are at the start.
       egos: vehicles under test; no other vehicle starts within `EGO_ROOM` on their lanes, or touches them.
       placed: other vehicles with a place of their own, for which the same holds.
+      common: goals of flows without one, and of vehicles at the start; None: all.
 
     Raises:
       ValueError: an unknown or unreachable origin or goal, a number out of range, a lane that is open to
@@ -69,7 +71,7 @@ def build_demand(
         raise ValueError(f"density = {density:g} veh/km; it has to be 0 or more, and finite")
     if vehicles is not None and vehicles < 0:
         raise ValueError(f"vehicles = {vehicles}; it has to be 0 or more")
-    tables = Tables.of(network, lane_map, goals, population)
+    tables = Tables.of(network, lane_map, goals, population, common)
     streams: list[Stream] = []
     for i, flow in enumerate(flows):
         streams += streams_of(tables, flow, i, horizon)

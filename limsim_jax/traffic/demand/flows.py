@@ -42,7 +42,7 @@ class Flow:
     rate: float
     """Vehicles per hour, of each origin."""
     goal: str | Mapping[str, float] | None = None
-    """Name of a goal, or shares by name (turning ratios); None: all reachable goals in equal shares."""
+    """Name of a goal, or shares by name (turning ratios); None: all ways out in reach, in equal shares."""
     pattern: str = "poisson"
     begin: float = 0.0
     """s"""
@@ -224,9 +224,11 @@ def _goal_shares(
     """Shares of the goals of a flow, adding up to 1."""
     reachable = np.any(tables.reachable[rows] & (weight > 0)[:, None], axis=0)
     if flow.goal is None:
-        if not reachable.any():
-            raise ValueError(f"{label}: it can reach none of the goals {_some(tables.goals)}")
-        return reachable / reachable.sum()
+        common = reachable & tables.common
+        if not common.any():
+            known = [name for name, wanted in zip(tables.goals, tables.common, strict=False) if wanted]
+            raise ValueError(f"{label}: it can reach none of the goals {_some(known)}")
+        return common / common.sum()
     shares = {flow.goal: 1.0} if isinstance(flow.goal, str) else dict(flow.goal)
     wanted = np.zeros(tables.reachable.shape[1])
     for name, share in shares.items():

@@ -42,10 +42,11 @@ def lay_out_seats(
     if initial:
         least = tables.lengths[1] + _CLEAR
         pitch = max(least, 500 / density)
-        row, s, slack = _places(tables, lanes, pitch, taken)
+        goals = tables.common | (wanted > 0)
+        row, s, slack = _places(tables, lanes, pitch, taken, goals)
         while len(row) < 1.5 * initial and pitch > least:
             pitch = max(least, 0.85 * pitch)
-            row, s, slack = _places(tables, lanes, pitch, taken)
+            row, s, slack = _places(tables, lanes, pitch, taken, goals)
     if len(row) < initial:
         raise ValueError(
             f"density = {density:g} veh/km puts {initial} vehicles on the roads at the start, "
@@ -53,7 +54,7 @@ def lay_out_seats(
         )
     feasible = tables.leaves_room(row, s + slack)
     share = np.where(feasible, wanted, 0)
-    share = np.where(share.any(1, keepdims=True), share, feasible)
+    share = np.where(share.any(1, keepdims=True), share, feasible & tables.common)
     types = tables.allowed[row] * tables.shares * _fits(tables, lanes, row, s, slack)
     weight = types.sum(1)
     return {
@@ -68,11 +69,15 @@ def lay_out_seats(
 
 
 def _places(
-    tables: Tables, lanes: list[Lane], pitch: float, taken: NDArray[np.float64]
+    tables: Tables,
+    lanes: list[Lane],
+    pitch: float,
+    taken: NDArray[np.float64],
+    goals: NDArray[np.bool_],
 ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
     """Places `pitch` m apart: row, hindmost front bumper (m) and room from there (m).
 
-    Bodies lie within one lane, some goal can be reached, and no two bodies of any size overlap.
+    Bodies lie within one lane, one of these goals can be reached, and no two bodies of any size overlap.
     """
     longest = tables.lengths[1]
     row, s, slack = [], [], []
@@ -82,7 +87,7 @@ def _places(
         s += front.tolist()
         slack += np.minimum(pitch - longest - _CLEAR, lane.length - _MARGIN - front).tolist()
     row, s, slack = np.array(row, int), np.array(s), np.array(slack)
-    useful = tables.leaves_room(row, s + slack).any(1)
+    useful = (tables.leaves_room(row, s + slack) & goals).any(1)
     useful &= (tables.allowed[row] & _fits(tables, lanes, row, s, slack) & (tables.shares > 0)).any(1)
     row, s, slack = row[useful], s[useful], slack[useful]
     # places that are taken come first, and of two places that touch the first is kept

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +26,7 @@ class Tables:
 
     network: Network
     goals: tuple[str, ...]
+    common: NDArray[np.bool_]  # [G] of traffic without a goal of its own
     rows: dict[str, int]
     classes: NDArray[np.int32]  # of the types of the population
     shares: NDArray[np.float64]  # of the types of the population, adding up to 1
@@ -39,9 +40,16 @@ class Tables:
 
     @staticmethod
     def of(
-        network: Network, lane_map: LaneMap, goals: Mapping[str, Sequence[str]], population: Population
+        network: Network,
+        lane_map: LaneMap,
+        goals: Mapping[str, Sequence[str]],
+        population: Population,
+        common: Collection[str] | None = None,
     ) -> Tables:
-        """Tables of a map, its goals and a population. Raises `ValueError` if the goals do not fit."""
+        """Tables of a map, its goals and a population.
+
+        `common` are the goals of traffic without one of its own; None: all.
+        Raises `ValueError` if the goals do not fit."""
         rows = lane_rows(network)
         is_goal = np.asarray(lane_map.routes.is_goal)
         for column, (name, lanes) in enumerate(goals.items()):
@@ -58,6 +66,7 @@ class Tables:
         return Tables(
             network=network,
             goals=tuple(goals),
+            common=_common(goals, common, is_goal.shape[1]),
             rows=rows,
             classes=classes,
             shares=share / share.sum(),
@@ -75,6 +84,13 @@ class Tables:
         room = self.change_distance[row] - np.asarray(s)[..., None]
         per_lane = np.maximum(CHANGE_ROOM, CHANGE_TIME * self.speed_limit[row])[..., None]
         return self.reachable[row] & (room > per_lane * np.abs(self.lanes_to_go[row]))
+
+
+def _common(goals: Iterable[str], common: Collection[str] | None, size: int) -> NDArray[np.bool_]:
+    found = np.zeros(size, bool)
+    for column, name in enumerate(goals):
+        found[column] = common is None or name in common
+    return found
 
 
 def cumulative(shares: NDArray[np.float64]) -> NDArray[np.float64]:
