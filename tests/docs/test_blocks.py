@@ -1,6 +1,7 @@
 """Every Python block of README and docs runs."""
 
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -10,8 +11,13 @@ import numpy as np
 import pytest
 from paths import REPO
 
+from limsim_jax.sweeps import experiment
+
 LONGEST = 10
 """Lines of a block without its imports."""
+
+HORIZON = 20.0
+"""s, of bundled experiments: unoptimised code drives a whole episode in minutes."""
 
 PAGES = [page for page in doc_blocks.pages() if page.mode != "none"]
 
@@ -35,6 +41,14 @@ def folder(tmp_path, monkeypatch):
         x.append(x[-1] + 0.1 * v)
     rows = [f"{t:.1f},{one:.3f},{other:.3f}" for t, one, other in zip(time, leader, x, strict=False)]
     (tmp_path / "pairs.csv").write_text("\n".join(["t,leader,follower", *rows]) + "\n")
+    short = {
+        name: tmp_path / ".bundled" / path.name for name, path in experiment.bundled_experiments().items()
+    }
+    (tmp_path / ".bundled").mkdir()
+    for name, path in experiment.bundled_experiments().items():
+        text = re.sub(r"^horizon = .*$", f"horizon = {HORIZON}", path.read_text(), flags=re.M)
+        short[name].write_text(text)
+    monkeypatch.setattr(experiment, "bundled_experiments", lambda: short)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
