@@ -69,7 +69,7 @@ def default_goals(network: Network) -> dict[str, tuple[str, ...]]:
 
 
 def last_lanes(network: Network, road: str) -> tuple[str, ...]:
-    """Ids of the drivable lanes of a road with no successor on the same road."""
+    """Ids of the drivable lanes at the ends of a road."""
     lanes = network.lanes
     return tuple(
         lane.id
@@ -118,14 +118,14 @@ def build_routes(
     graph = _LaneGraph(network, rows, vehicle_class)
     columns = [[rows[name] for name in group] for group in groups]
     table = graph.solve(columns, change_penalty, tolerance, short_penalty=short_penalty)
-    for column, name in enumerate(goals if isinstance(goals, Mapping) and prescribed else ()):
-        if name in prescribed:
-            way = build_fixed_routes(
-                network, rows, [prescribed[name]], vehicle_class=vehicle_class,
-                change_penalty=change_penalty, tolerance=tolerance,
-            )  # fmt: skip
-            for field, values in vars(way).items():
-                vars(table)[field][:, column] = values[:, 0]
+    names = list(goals) if isinstance(goals, Mapping) else []
+    for name, roads in (prescribed or {}).items():
+        way = build_fixed_routes(
+            network, rows, [roads], vehicle_class=vehicle_class,
+            change_penalty=change_penalty, tolerance=tolerance,
+        )  # fmt: skip
+        for field, values in vars(way).items():
+            vars(table)[field][:, names.index(name)] = values[:, 0]
     return table
 
 

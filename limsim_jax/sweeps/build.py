@@ -109,7 +109,7 @@ def _own(name: str, where: str) -> Callable[..., PolicyLike]:
 
 
 def map_of(experiment: ExperimentFile, town: Map | None = None) -> Map:
-    """The map, with every lane and route that is named as a goal."""
+    """The map, with lanes and routes that are named as goals."""
     if town is None:
         try:
             town = load_map(bundled_maps().get(experiment.map, experiment.map))
