@@ -276,11 +276,11 @@ def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
     calls = []
     build = rasterise.build_lane_map
 
-    def counted(network, goals=None, *, report=None):
+    def counted(network, goals=None, routes=None, *, report=None):
         calls.append(goals)
         assert report is not None
         report.approximated("lane", "somewhere", "by 1 mm")
-        return build(network, goals, report=report)
+        return build(network, goals, routes, report=report)
 
     monkeypatch.setattr(rasterise, "build_lane_map", counted)
     network = read_network(file)
@@ -300,6 +300,9 @@ def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
         build_lane_map(network, same)
     build_lane_map(network, groups[::-1])
     assert calls == [None, goals, groups[::-1]]
+    name, (lane, *_) = next(iter(goals.items()))
+    build_lane_map(network, goals, {name: [network.lanes[lane].road]})
+    assert len(calls) == 4, "a route makes another table"
 
 
 def test_network_that_was_changed_is_not_taken_from_the_cache(file, folder):
