@@ -118,14 +118,14 @@ def build_routes(
     graph = _LaneGraph(network, rows, vehicle_class)
     columns = [[rows[name] for name in group] for group in groups]
     table = graph.solve(columns, change_penalty, tolerance, short_penalty=short_penalty)
-    names = list(goals) if isinstance(goals, Mapping) else []
-    for name, roads in (prescribed or {}).items():
-        way = build_fixed_routes(
-            network, rows, [roads], vehicle_class=vehicle_class,
+    if prescribed:
+        names = list(goals) if isinstance(goals, Mapping) else []
+        ways = build_fixed_routes(
+            network, rows, list(prescribed.values()), vehicle_class=vehicle_class,
             change_penalty=change_penalty, tolerance=tolerance,
         )  # fmt: skip
-        for field, values in vars(way).items():
-            vars(table)[field][:, names.index(name)] = values[:, 0]
+        for field, values in vars(ways).items():
+            vars(table)[field][:, [names.index(name) for name in prescribed]] = values
     return table
 
 

@@ -140,7 +140,8 @@ def check_routes(experiment: ExperimentFile, town: Map) -> None:
             if twice:
                 raise ExperimentError(f"{where}: visits road '{twice[0]}' twice; once is possible")
             try:
-                build_fixed_routes(town.network, rows, [table.route] if table.route else [])
+                if table.route:
+                    build_fixed_routes(town.network, rows, [table.route])
             except MapError as error:
                 raise ExperimentError(f"{where}: {error.reason}") from None
 

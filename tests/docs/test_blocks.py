@@ -41,13 +41,11 @@ def folder(tmp_path, monkeypatch):
         x.append(x[-1] + 0.1 * v)
     rows = [f"{t:.1f},{one:.3f},{other:.3f}" for t, one, other in zip(time, leader, x, strict=False)]
     (tmp_path / "pairs.csv").write_text("\n".join(["t,leader,follower", *rows]) + "\n")
-    short = {
-        name: tmp_path / ".bundled" / path.name for name, path in experiment.bundled_experiments().items()
-    }
+    short = {}
     (tmp_path / ".bundled").mkdir()
     for name, path in experiment.bundled_experiments().items():
-        text = re.sub(r"^horizon = .*$", f"horizon = {HORIZON}", path.read_text(), flags=re.M)
-        short[name].write_text(text)
+        short[name] = tmp_path / ".bundled" / path.name
+        short[name].write_text(re.sub(r"(?m)^horizon = .*$", f"horizon = {HORIZON}", path.read_text()))
     monkeypatch.setattr(experiment, "bundled_experiments", lambda: short)
     monkeypatch.chdir(tmp_path)
     return tmp_path
