@@ -60,9 +60,9 @@ def check(
 ) -> int:
     """Say whether a map can be trusted: exit code 0 if it is clean, 1 if not, 2 if it cannot be used.
 
-    Findings are what the reader had to repair, links at which the centre line jumps by more than 1 cm
-    or 0.5 degrees, and circles of lanes each of which yields to the next. With --strict, what was
-    approximated, ignored or added is a finding as well.
+    Findings are what the reader had to repair or cannot use, links at which the centre line jumps by more
+    than 1 cm or 0.5 degrees, and circles of lanes each of which yields to the next. With --strict, what
+    was approximated, ignored or added is a finding as well.
     """
     from limsim_jax.maps import build_lane_map
     from limsim_jax.maps.check import deadlocks, seams
@@ -72,7 +72,7 @@ def check(
     report = copy.deepcopy(network.report)
     build_lane_map(network, report=report, cache=not no_cache)
     broken, circles = list(seams(network)), deadlocks(network)
-    counted = {*Action} - {Action.READ} if strict else {Action.REPAIRED}
+    counted = {*Action} - {Action.READ} if strict else {Action.REPAIRED, Action.UNUSABLE}
     findings = len(broken) + len(circles) + sum(report.total(action) for action in counted)
     if json_file is not None:
         write_json(

@@ -84,8 +84,10 @@ def build_lane_map(
 
 def _spell(goals: Goals | None) -> str:
     """Text that is equal for goals that make equal arrays."""
+    from limsim_jax.maps.routing import Round
+
     groups = goals.values() if isinstance(goals, Mapping) else goals
-    return repr(groups and [group if isinstance(group, str) else list(group) for group in groups])
+    return repr(groups and [(isinstance(group, Round), *group) for group in groups])
 
 
 def bundled_maps() -> dict[str, Path]:
@@ -104,6 +106,12 @@ def bundled_map(name: str) -> Path:
 
 
 def _read(path: Path, root: str) -> Network:
+    from limsim_jax.maps.cut import without_gorges
+
+    return without_gorges(_read_file(path, root))
+
+
+def _read_file(path: Path, root: str) -> Network:
     if root == "OpenDRIVE":
         from limsim_jax.maps.opendrive import read_opendrive
 

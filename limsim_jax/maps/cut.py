@@ -19,6 +19,7 @@ from limsim_jax.maps.network import (
     LaneType,
     Network,
 )
+from limsim_jax.maps.widths import CAR_LENGTH, fits_cars
 
 SHORTEST = 5.0
 """m: a cut nearer to another cut or to the end of its lanes is moved there."""
@@ -89,14 +90,14 @@ def cut(network: Network, cuts: Cuts) -> Network:
     )
 
 
-def close(network: Network, lanes: Iterable[str]) -> Network:
-    """The network with lanes that are closed to all traffic."""
+def close(network: Network, lanes: Iterable[str], kind: LaneType = LaneType.ROAD_WORKS) -> Network:
+    """The network with lanes that are closed, and of this type."""
     closed = set(lanes)
     open_only = lambda names: tuple(x for x in names if x not in closed)  # noqa: E731
     found = {
         lane.id: replace(
             lane,
-            type=LaneType.ROAD_WORKS if lane.id in closed else lane.type,
+            type=kind if lane.id in closed else lane.type,
             successors=() if lane.id in closed else open_only(lane.successors),
             predecessors=() if lane.id in closed else open_only(lane.predecessors),
             may_change_left=lane.may_change_left and lane.id not in closed and lane.left not in closed,
@@ -105,6 +106,55 @@ def close(network: Network, lanes: Iterable[str]) -> Network:
         for lane in network.lanes.values()
     }
     return replace(network, lanes=found)
+
+
+def without_gorges(network: Network) -> Network:
+    """The network without stretches of lanes on which no car fits.
+
+    Lanes stay as they are inside junctions, where no car fits on any part of them, and where they only begin
+    or end so. Notes go to the report of the network.
+    """
+    sections: dict[tuple[str, int], list[Lane]] = {}
+    for lane in network.drivable_lanes():
+        sections.setdefault((lane.road, lane.section), []).append(lane)
+    cuts: dict[tuple[str, int], list[float]] = {}
+    shut: list[tuple[Lane, float, float]] = []
+    for key, lanes in sections.items():
+        narrow = [(lane, *stretch) for lane in lanes for stretch in _narrow(lane)]
+        gorges = [(lane, a, b) for lane, a, b in narrow if a > 0 and b < lane.length]
+        if gorges and all(lane.junction is None for lane in lanes):
+            cuts[key] = [float(np.interp(s, x.s, x.road_s)) for x, a, b in narrow for s in (a, b)]
+            shut += narrow
+    if not shut:
+        return network
+    found = cut(network, cuts)
+    for lane, begin, end in shut:
+        message = f"no car fits from s = {begin:.1f} to {end:.1f} m: closed there"
+        network.report.approximated("lane width", f"lane {lane.id}", message)
+    of = {lane.id for lane, _, _ in shut}
+    narrow = [
+        lane.id
+        for lane in found.drivable_lanes()
+        if lane.id.split("/")[0] in of and not fits_cars(lane)[len(lane.s) // 2]
+    ]
+    return close(found, narrow, LaneType.NONE)
+
+
+def _narrow(lane: Lane) -> list[tuple[float, float]]:
+    """Stretches (m) of a lane on which no car fits; those closer than a car are one."""
+    fits = fits_cars(lane)
+    if not fits.any():
+        return []
+    edges = np.nonzero(np.diff(np.concatenate([[True], fits, [True]]).astype(int)))[0]
+    found: list[tuple[float, float]] = []
+    for first, beyond in edges.reshape(-1, 2).tolist():
+        begin = 0.0 if first == 0 else float(lane.s[first - 1])
+        end = lane.length if beyond == len(fits) else float(lane.s[beyond])
+        if found and begin - found[-1][1] < CAR_LENGTH:
+            found[-1] = found[-1][0], end
+        else:
+            found.append((begin, end))
+    return found
 
 
 def piece_at(lanes: Mapping[str, Lane], name: str, s: float) -> tuple[str, float]:

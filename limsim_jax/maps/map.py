@@ -114,6 +114,8 @@ def route_name(roads: Sequence[str]) -> str:
 
 def _without(ways: Mapping[str, tuple[str, ...]], barred: frozenset[str]) -> dict[str, tuple[str, ...]]:
     """Ways in or out without some lanes."""
+    if not barred:
+        return dict(ways)
     found = {name: tuple(x for x in lanes if x not in barred) for name, lanes in ways.items()}
     return {name: lanes for name, lanes in found.items() if lanes}
 

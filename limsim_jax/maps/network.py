@@ -63,6 +63,7 @@ class Action(enum.StrEnum):
     IGNORED = "ignored"  # not taken over
     REPAIRED = "repaired"  # broken in the file, repaired here
     ADDED = "added"  # not in the file, and needed: made up here
+    UNUSABLE = "unusable"  # stated in the file, and nothing that traffic could follow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +113,10 @@ class ImportReport:
     def added(self, element: str, where: str, message: str, line: int | None = None) -> None:
         """Record something that is needed, missing in the file and made up."""
         self._note(Action.ADDED, element, where, message, line)
+
+    def unusable(self, element: str, where: str, message: str, line: int | None = None) -> None:
+        """Record a statement of the file that traffic cannot follow."""
+        self._note(Action.UNUSABLE, element, where, message, line)
 
     def _note(
         self, action: Action, element: str, where: str, message: str, line: int | None, count: int = 1

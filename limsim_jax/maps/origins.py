@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from limsim_jax.maps.network import Lane, Network
+from limsim_jax.maps.routing import Round, default_goals
 
 LEAST_LENGTH = 60.0
 """m: `road_origins` names no shorter road."""
@@ -30,8 +31,10 @@ def road_origins(network: Network, count: int) -> list[str]:
     """Names of roads that serve as origins on a map without `origins`.
 
     At most `count` of them, spread evenly over the map's list of roads. None is shorter than
-    `LEAST_LENGTH`.
+    `LEAST_LENGTH`. Rings have none: what is on them stays there.
     """
+    if any(isinstance(lanes, Round) for lanes in default_goals(network).values()):
+        return []
     names = [
         name
         for name, lanes in road_starts(network).items()

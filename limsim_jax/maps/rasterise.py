@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from limsim_jax.geometry import derivative, polynomial
+from limsim_jax.maps.bridges import goes_on_beside, side_step
 from limsim_jax.maps.conflicts import build_conflicts
 from limsim_jax.maps.lane_map import (
     CELL,
@@ -34,6 +35,7 @@ from limsim_jax.maps.lane_map import (
 from limsim_jax.maps.network import ImportReport, Lane, MapError, Network
 from limsim_jax.maps.routing import build_routes, default_goals
 from limsim_jax.maps.signals import build_signals
+from limsim_jax.maps.widths import begins_narrow, ends_narrow, wide_from, wide_until
 
 Floats = NDArray[np.float64]
 
@@ -48,9 +50,6 @@ WORST_DEVIATION = 0.05
 
 TURN_WINDOW = 4.0
 """`curvature_max` is the mean over a stretch of this length, m: about a wheelbase and a half."""
-
-MIN_WIDTH = 2.7
-"""Least width of a lane for all vehicles, m: a bus is 2.55 m wide."""
 
 SIGHT = 50.0
 """Distance that every vehicle must see ahead, m: to stop from 70 km/h with 4 m/s^2."""
@@ -130,6 +129,7 @@ def build_lane_map(
         "length": 1.0,
         "speed_limit": 1.0,
         "stop_s": 1.0,
+        "start_s": 0.0,
         "end_s": 1.0,
     }
     tables |= {
@@ -155,37 +155,50 @@ def build_lane_map(
 
 
 def _without_side_steps(network: Network, report: ImportReport | None) -> Network:
-    """The network without links by which a vehicle would leap sideways.
+    """The network without links that lead sideways, or where no car fits.
 
     In some files two lanes continue as one where one of them ends beside it. Without the link from that one,
-    its vehicles change lanes.
+    its vehicles change lanes. So they do where a lane narrows to nothing or opens from it, and the lane
+    beside goes on.
     """
     lanes = dict(network.lanes)
     for lane in network.drivable_lanes():
-        beside = [lanes[name] for name in (lane.left, lane.right) if name in lanes]
-        most = lane.width[-1] / 2
         for name in lane.successors:
-            going = [x for x in beside if name in x.successors and _side_step(x, lanes[name]) <= most]
-            if not going or (step := _side_step(lane, lanes[name])) <= most:
+            after = network.lanes[name]
+            going = goes_on_beside(network.lanes, lane, after)
+            if going is not None:
+                step = side_step(lane, after)
+                why = f"begins {step:.1f} m beside the end of {lane.id}: traffic changes to {going.id}, "
+                why += f"which continues as {name}"
+            elif beside := _way_round(network.lanes, lane, after):
+                why = f"is too narrow where {lane.id} leads into it: traffic changes lanes with {beside.id}"
+            else:
                 continue
             before, after = lanes[lane.id], lanes[name]
             lanes[lane.id] = replace(before, successors=tuple(x for x in before.successors if x != name))
             lanes[name] = replace(after, predecessors=tuple(x for x in after.predecessors if x != lane.id))
             if report is not None:
-                report.repaired(
-                    "lane link",
-                    f"{lane.id} -> {name}",
-                    f"{name} begins {step:.1f} m beside the end of {lane.id}: traffic changes to "
-                    f"{going[0].id}, which continues as {name}",
-                )
+                report.repaired("lane link", f"{lane.id} -> {name}", f"{name} {why}")
     return network if lanes == network.lanes else replace(network, lanes=lanes)
 
 
-def _side_step(before: Lane, after: Lane) -> float:
-    """Lateral distance (m) from the end of a lane to the next."""
-    off = after.xyz[0, :2] - before.xyz[-1, :2]
-    heading = before.heading[-1]
-    return abs(float(off[1] * np.cos(heading) - off[0] * np.sin(heading)))
+def _way_round(lanes: Mapping[str, Lane], before: Lane, after: Lane) -> Lane | None:
+    """The lane by which traffic avoids a link that is too narrow.
+
+    None where it need not or cannot. Lanes that are narrow as a whole are driven as they are.
+    """
+    if not after.drivable or before.junction is not None or after.junction is not None:
+        return None
+    if ends_narrow(before):
+        sides = ((before.left, before.may_change_left), (before.right, before.may_change_right))
+        return next((lanes[x] for x, may in sides if x and may and lanes[x].successors), None)
+    if begins_narrow(after):
+        for name in (after.left, after.right):
+            if name and lanes[name].predecessors:
+                other = lanes[name]
+                if other.may_change_left if other.left == after.id else other.may_change_right:
+                    return other
+    return None
 
 
 def _rule_tables(
@@ -277,7 +290,8 @@ def _lane_tables(network: Network, lanes: list[Lane]) -> dict[str, NDArray[Any]]
     return {
         "speed_limit": np.array([lane.speed_limit for lane in lanes], float),
         "stop_s": stop_s,
-        "end_s": np.array([_wide_until(lane) for lane in lanes]),
+        "start_s": np.array([wide_from(lane) for lane in lanes]),
+        "end_s": np.array([wide_until(lane) for lane in lanes]),
         "left": left,
         "right": right,
         "opposite": np.array([row_of(lane, lane.opposite) for lane in lanes]),
@@ -299,9 +313,9 @@ def _lane_tables(network: Network, lanes: list[Lane]) -> dict[str, NDArray[Any]]
 def _beside(lanes: list[Lane], rows: Mapping[str, int], side: Literal["left", "right"]) -> Floats:
     """Distance (m) on which the neighbour of each lane runs beside it.
 
-    It is measured from the start of the lane to where the neighbour parts from it. A junction parts lanes,
-    too. Where lanes fork, the branch on which they part first counts. Beyond this lane at most `_BESIDE` m
-    count.
+    It is measured from the start of the lane to where the neighbour parts from it, or becomes too narrow. A
+    junction parts lanes, too. Where lanes fork, the branch on which they part first counts. Beyond this lane
+    at most `_BESIDE` m count.
     """
 
     def goes_on(lane: Lane, after: str) -> bool:
@@ -312,7 +326,9 @@ def _beside(lanes: list[Lane], rows: Mapping[str, int], side: Literal["left", "r
         )
 
     length = np.array([lane.length for lane in lanes])
-    found = np.where([getattr(lane, side) in rows for lane in lanes], length, 0.0)
+    names = [getattr(lane, side) for lane in lanes]
+    taper = [_taper(lanes[rows[name]]) if name in rows else 0.0 for name in names]
+    found = np.where([name in rows for name in names], np.maximum(length - taper, 0.0), 0.0)
     on = [
         [rows[after] if goes_on(lane, after) else -1 for after in lane.successors if after in rows]
         if getattr(lane, side) in rows
@@ -326,6 +342,11 @@ def _beside(lanes: list[Lane], rows: Mapping[str, int], side: Literal["left", "r
                 found[row] = length[row] + min(_BESIDE, *(found[k] if k >= 0 else 0.0 for k in after))
         if (found == before).all():
             return found
+
+
+def _taper(lane: Lane) -> float:
+    """Length of the narrow end of a lane without successors, m."""
+    return lane.length - wide_until(lane)
 
 
 def _lanes_in_sight(lanes: list[Lane], rows: Mapping[str, int]) -> int:
@@ -342,17 +363,6 @@ def _lanes_in_sight(lanes: list[Lane], rows: Mapping[str, int]) -> int:
             [lane.length + min(ways, default=SIGHT) for lane, ways in zip(lanes, after, strict=True)]
         )
     return _MOST
-
-
-def _wide_until(lane: Lane) -> float:
-    """Where a lane without successors becomes too narrow, m from its start.
-
-    For all other lanes it is their length.
-    """
-    wide = np.nonzero(lane.width >= MIN_WIDTH)[0]
-    if lane.successors or not len(wide) or wide[-1] == len(lane.width) - 1:
-        return lane.length
-    return float(lane.s[wide[-1]])
 
 
 @dataclass(frozen=True)

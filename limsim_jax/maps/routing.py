@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from limsim_jax.maps.network import Lane, MapError, Network
 from limsim_jax.maps.route_table import FAR, RouteTable
+from limsim_jax.maps.widths import ends_narrow
 
 Floats = NDArray[np.float64]
 
@@ -38,16 +39,26 @@ TOLERANCE = 5.0
 """Difference of length within which lanes to the same place are equally good, m."""
 
 
+class Round(tuple[str, ...]):
+    """Lanes of a goal that traffic passes: it goes round and round, and never arrives."""
+
+    __slots__ = ()
+
+
 def default_goals(network: Network) -> dict[str, tuple[str, ...]]:
     """The ways out of a map: groups of lane ids by name.
 
     There is one goal per road and direction on which traffic leaves the map: the last lanes, none of which
-    has a drivable successor. A map without exits (closed loops) has one goal per road and direction outside
-    junctions: the last lanes on it. A lane that ends beside one that continues is no goal.
+    has a drivable successor. A lane that ends beside one that continues is no goal, nor is one that narrows
+    to nothing beside another. On a map without exits
+    there is one goal per road and direction outside junctions: the last lanes on it. Where such a map has
+    rings only, without a fork, traffic goes round: there is one goal per ring, a `Round`.
 
     Names are road ids. Where a road has traffic both ways, `+` or `-` follows, the sign of its lane numbers
-    (OpenDRIVE).
+    (OpenDRIVE). Goals of rings are named `round` and the name of their first road.
     """
+    if rings := _rings(network):
+        return rings
     lanes = {lane.id: lane for lane in network.drivable_lanes()}
     go_on = {lane.carriageway for lane in lanes.values() if any(name in lanes for name in lane.successors)}
     ends = [lane for lane in lanes.values() if lane.carriageway not in go_on]
@@ -59,23 +70,69 @@ def default_goals(network: Network) -> dict[str, tuple[str, ...]]:
             and (lane.successors or lane.carriageway not in go_on)
             and not any(lanes[x].road == lane.road for x in lane.successors if x in lanes)
         ]
-    ways = {(lane.road, lane.number < 0) for lane in lanes.values()}
     goals: dict[str, tuple[str, ...]] = {}
-    for lane in ends:
-        both = {(lane.road, True), (lane.road, False)} <= ways
-        name = lane.road + (("-" if lane.number < 0 else "+") if both else "")
+    name_of = _way_names(network)
+    for lane in _wide_ends(ends):
+        name = name_of[lane.road, lane.number < 0]
         goals[name] = (*goals.get(name, ()), lane.id)
+    return goals
+
+
+def _way_names(network: Network) -> dict[tuple[str, bool], str]:
+    """Names of roads and directions."""
+    ways = {(lane.road, lane.number < 0) for lane in network.drivable_lanes()}
+    return {
+        (road, negative): road + (("-" if negative else "+") if (road, not negative) in ways else "")
+        for road, negative in ways
+    }
+
+
+def _rings(network: Network) -> dict[str, tuple[str, ...]]:
+    """Goals of a map of rings: closed ways that no road leaves or joins. Empty for other maps."""
+    lanes = {lane.id: lane for lane in network.drivable_lanes()}
+    onward: dict[tuple[str, bool], set[tuple[str, bool]]] = {}
+    last: dict[tuple[str, bool], list[str]] = {}
+    sections: dict[tuple[str, bool], set[int]] = {}
+    for lane in lanes.values():
+        sections.setdefault((lane.road, lane.number < 0), set()).add(lane.section)
+    for lane in lanes.values():
+        way = lane.road, lane.number < 0
+        forward = lane.road_s[-1] >= lane.road_s[0]
+        if lane.section == (max if forward else min)(sections[way]):
+            after = [lanes[name] for name in lane.successors if name in lanes]
+            onward.setdefault(way, set()).update((x.road, x.number < 0) for x in after)
+            if after:
+                last.setdefault(way, []).append(lane.id)
+    if any(len(ways) != 1 for ways in onward.values()) or len(onward) < len(sections):
+        return {}
+    comes_after = {way: next(iter(ways)) for way, ways in onward.items()}
+    if len(set(comes_after.values())) < len(comes_after):
+        return {}
+    name_of, goals, seen = _way_names(network), {}, set()
+    for way in comes_after:
+        if way not in seen:
+            goals[f"round {name_of[way]}"] = Round(last[way])
+        while way not in seen:
+            seen.add(way)
+            way = comes_after[way]
     return goals
 
 
 def last_lanes(network: Network, road: str) -> tuple[str, ...]:
     """Ids of the drivable lanes at the ends of a road."""
     lanes = network.lanes
-    return tuple(
-        lane.id
+    ends = [
+        lane
         for lane in network.drivable_lanes()
         if lane.road == road and all(lanes[x].road != road for x in lane.successors if x in lanes)
-    )
+    ]
+    return tuple(lane.id for lane in _wide_ends(ends))
+
+
+def _wide_ends(ends: list[Lane]) -> list[Lane]:
+    """Lanes without those that narrow to nothing beside another that does not."""
+    wide = {lane.carriageway for lane in ends if not ends_narrow(lane)}
+    return [lane for lane in ends if lane.carriageway not in wide or not ends_narrow(lane)]
 
 
 def build_routes(
@@ -118,6 +175,9 @@ def build_routes(
     graph = _LaneGraph(network, rows, vehicle_class)
     columns = [[rows[name] for name in group] for group in groups]
     table = graph.solve(columns, change_penalty, tolerance, short_penalty=short_penalty)
+    for column, group in enumerate(groups):
+        if isinstance(group, Round):
+            graph.pass_goal(table, column)
     if prescribed:
         names = list(goals) if isinstance(goals, Mapping) else []
         ways = build_fixed_routes(
@@ -286,6 +346,13 @@ class _LaneGraph:
         if not count:
             return np.full((size, count), np.inf)
         return dijkstra(graph, indices=size + np.arange(count))[:, :size].T
+
+    def pass_goal(self, table: RouteTable, column: int) -> None:
+        """Let the lanes of a goal lead on: no vehicle arrives there."""
+        first = {tail: head for tail, head in self.ahead[::-1].tolist()}
+        for row in np.nonzero(np.asarray(table.is_goal)[:, column])[0].tolist():
+            np.asarray(table.next_lane)[row, column] = first[row]
+            np.asarray(table.is_goal)[row, column] = False
 
     def solve(
         self,

@@ -106,7 +106,7 @@ def place_beside(
     """The place beside every vehicle, and whether it may change there.
 
     It may not where road marks forbid it, in junctions, by vehicle class, during another change, or too
-    late to finish before the lanes part.
+    late to finish before the lanes part, or while the other lane is still narrow.
 
     Args:
       lane_map: where.
@@ -126,8 +126,10 @@ def place_beside(
     mean = jnp.maximum(state.v - state.driver.b * time / 3, LANE_CHANGES.slowed * state.v)
     needed = jnp.maximum(mean, LANE_CHANGES.creep_speed) * time
     allowed &= room_beside(lane_map, state.lane, state.s, side) > needed
-    lane = jnp.where(allowed, lane, NO_LANE)
-    return lane, side_s(lane_map, state.lane, state.s, side), allowed
+    # where it crosses the border, in the middle of the change, its rear is on a lane that is wide enough
+    s = side_s(lane_map, state.lane, state.s, side)
+    allowed &= s + needed / 2 - state.shape.length >= lane_map.start_s[lane]
+    return jnp.where(allowed, lane, NO_LANE), s, allowed
 
 
 @jax.named_scope("choose_lane")

@@ -376,24 +376,34 @@ RARE_BENDS = 50
 CAR = 5.0
 """m, length up to which a vehicle fits everywhere."""
 
+SIDE_ROOM = 0.2
+"""m, by which a lane has to be wider than a vehicle on it."""
+
 
 def restrict_to_map(population: Population, lane_map: LaneMap) -> Population:
-    """Leave out vehicle types too long for the bends of a map.
+    """Leave out vehicle types too long or too wide for a map.
 
     In a bend of curvature kappa the ends of a body of length l stand out by kappa l^2 / 8. On most urban
     junctions that leaves trucks and buses no room beside traffic in the next lane, so they get no share.
-    One lane in `RARE_BENDS` may be tighter. Cars drive everywhere.
+    One lane in `RARE_BENDS` may be tighter, or narrower than a vehicle. Cars drive everywhere.
 
     Raises:
       ValueError: none fits.
     """
     bends = np.asarray(lane_map.curvature_max)[np.asarray(lane_map.valid)]
     bend = float(np.quantile(bends, 1 - 1 / RARE_BENDS, method="lower"))
-    length = np.asarray(population.median)[:, PARAMETERS.index("length")]
+    length, wide = (np.asarray(population.median)[:, PARAMETERS.index(x)] for x in ("length", "width"))
     fits = (bend * length * length / 8 <= SWEEP) | (length <= CAR)
+    rows, begin, count = (np.asarray(x) for x in (lane_map.rows, lane_map.first, lane_map.count))
+    middle = (begin + count // 2)[np.asarray(lane_map.valid)]
+    narrow = float(np.quantile(rows[middle, 8], 1 / RARE_BENDS, method="higher"))
+    fits &= (wide + SIDE_ROOM <= narrow) | (length <= CAR)
     share = np.where(fits, np.asarray(population.share), 0)
     if not share.any():
-        raise ValueError(f"no vehicle of the population fits into bends of {1 / bend:.1f} m radius")
+        raise ValueError(
+            f"no vehicle of the population fits into bends of {1 / max(bend, 1e-9):.1f} m radius "
+            f"and lanes of {narrow:.2f} m"
+        )
     return replace(population, share=jnp.asarray(share, jnp.float32))
 
 

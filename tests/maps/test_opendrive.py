@@ -280,7 +280,7 @@ GOOD = road("1", [section(0, [], [lane(-1)])])
             "attribute 'length' is 'nan', not a finite number",
         ),
         (GOOD.replace('length="100.0"', "", 1), "attribute 'length' is missing"),
-        (GOOD.replace('length="100.0"', 'length="-3"', 1), "needs a length above zero"),
+        (GOOD.replace('length="100.0"', 'length="-3"', 1), "a road cannot be shorter than 0"),
         (GOOD.replace("<line/>", "<loop/>"), "unknown shape"),
         (GOOD.replace("<line/>", ""), "has no shape"),
         (GOOD.replace("<line/>", '<arc curvature="1e9"/>'), "curvature is in 1/m"),

@@ -202,7 +202,7 @@ def test_virtual_junction_attaches_inside_the_main_road(read):
         "2",
         [section(0, [], [lane(-1, links={"successor": -1})])],
         x=50,
-        y=-60,
+        y=-71.75,
         hdg=math.pi / 2,
         length=50,
         links=link("successor", "20", "start"),
@@ -211,7 +211,7 @@ def test_virtual_junction_attaches_inside_the_main_road(read):
         "20",
         [section(0, [], [lane(-1, links=two_way(-1))])],
         x=50,
-        y=-10,
+        y=-21.75,
         hdg=math.pi / 2,
         length=10.0,
         junction=9,
@@ -221,9 +221,10 @@ def test_virtual_junction_attaches_inside_the_main_road(read):
     network = read(main, drive, into, junction)
     before, after = network.lane_at("1", -1, 10), network.lane_at("1", -1, 90)
     assert before.id != after.id and after.road_s[0] == 60.0
-    assert set(after.predecessors) == {before.id, "20_0_-1"}
+    across = f"20_0_-1~{after.id}"  # the connecting road of this file ends 10 m before the main road
+    assert set(after.predecessors) == {before.id, across}
     (movement,) = network.movements
-    assert (movement.incoming, movement.via, movement.outgoing) == ("2_0_-1", ("20_0_-1",), after.id)
+    assert (movement.incoming, movement.via, movement.outgoing) == ("2_0_-1", ("20_0_-1", across), after.id)
 
 
 def test_missing_contact_point_and_lane_links_are_repaired(read):

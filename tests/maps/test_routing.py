@@ -18,6 +18,7 @@ from limsim_jax.maps.routing import (
     NO_WAY,
     ROOM_TO_CHANGE,
     SHORT_PENALTY,
+    Round,
     build_fixed_routes,
     build_routes,
     default_goals,
@@ -165,8 +166,11 @@ def test_loops_and_goals_on_the_way():
     got = column(net, [["r2_0"]])
     assert [got[f"r{i}_0"]["distance"] for i in range(4)] == [300, 200, 100, 400]
     assert got["r2_0"]["next"] is None
-    goals = {f"r{i}_": (f"r{i}_0",) for i in range(4)}
-    assert default_goals(net) == goals
+    goals = default_goals(net)
+    assert goals == {"round r0_": ("r0_0",)} and isinstance(goals["round r0_"], Round)
+    table = build_routes(net, rows(net), goals)
+    assert table.reachable[:-1].all() and not table.is_goal.any(), "traffic goes round and never arrives"
+    assert table.next_lane[:-1, 0].tolist() == [1, 2, 3, 0]
     ends = [lane for i in range(4) for lane in road(f"r{i}_", [100, 60], {0: [f"r{(i + 1) % 4}_0"]})]
     assert default_goals(network(ends)) == goals, "a lane that ends beside one that continues is no goal"
 

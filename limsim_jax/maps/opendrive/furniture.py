@@ -463,6 +463,47 @@ def extend_lights(
     return result
 
 
+def fit_arrows(
+    lights: list[TrafficLight], movements: tuple[Movement, ...], lanes: dict[str, Lane], report: ImportReport
+) -> list[TrafficLight]:
+    """Lights with arrows that fit the ways below them.
+
+    The validity says which lane; an arrow only chooses among several ways from it. Where no way turns as
+    the arrow does, its light governs the ways that no other light over the lane names.
+    """
+    entry = _entries(movements)
+    over: dict[str, list[int]] = defaultdict(list)  # entering lane -> lights
+    for i, light in enumerate(lights):
+        for spot in light.spots:
+            if (name := downstream(spot, lanes, entry)) is not None:
+                over[name].append(i)
+    result = list(lights)
+    for name, found in over.items():
+        ways = {movements[m].turn for m in entry[name]}
+        for i in found:
+            if not lights[i].turns or ways & set(lights[i].turns):
+                continue
+            others = {turn for j in found if j != i for turn in lights[j].turns}
+            more = sorted((ways - others) or ways)
+            result[i] = replace(result[i], turns=tuple(dict.fromkeys((*result[i].turns, *more))))
+            report.approximated(
+                "traffic light",
+                lights[i].id,
+                f"shows {lights[i].turns[0]}, no way from lane {name}: governs {' and '.join(more)}",
+                lights[i].line,
+            )
+    return result
+
+
+def _entries(movements: tuple[Movement, ...]) -> dict[str, list[int]]:
+    """Movements by each lane on their way into and across the junction."""
+    entry: dict[str, list[int]] = defaultdict(list)
+    for m in movements:
+        for name in (m.incoming, *m.via):
+            entry[name].append(m.index)
+    return entry
+
+
 def regulate(
     movements: tuple[Movement, ...],
     lanes: dict[str, Lane],
@@ -471,11 +512,7 @@ def regulate(
     report: ImportReport,
 ) -> tuple[Movement, ...]:
     """Give every movement its control: light before sign before priority record."""
-    entry: dict[str, list[int]] = defaultdict(list)
-    for m in movements:
-        entry[m.incoming].append(m.index)
-        for via in m.via:
-            entry[via].append(m.index)
+    entry = _entries(movements)
     control: dict[int, Control] = {}
     order = {Control.PRIORITY: 0, Control.YIELD: 1, Control.STOP: 2, Control.SIGNAL: 3}
     meaning = {

@@ -187,7 +187,7 @@ class Cutter:
                 self.report.repaired(
                     "laneSection",
                     f"road {road.id} s={section.s:g}",
-                    f"is {max(end - start, 0.0):g} m long: left out, its links pass through",
+                    f"is {round(max(end - start, 0.0), 5):g} m long: left out, its links pass through",
                     section.line,
                 )
                 continue
@@ -293,7 +293,7 @@ class Cutter:
     ) -> dict[int, Attributes]:
         numbers = sorted(n for n in section.lanes if n != 0)
         types = {n: self._type(road, section.lanes[n]) for n in numbers}
-        forward = {n: _forward(road, section.lanes[n]) for n in numbers}
+        forward = {n: runs_forward(road, section.lanes[n]) for n in numbers}
         real = self._real(road.id, shape, section, numbers)
         result = {}
         for n in numbers:
@@ -409,7 +409,13 @@ def _changes(lane: RawLane) -> list[float]:
     return [m.s for m in lane.marks] + [s for s, _ in lane.speeds] + [s for s, _, _ in lane.access]
 
 
-def _forward(road: RawRoad, lane: RawLane) -> bool:
+def carries_traffic(lane: RawLane) -> bool:
+    """Whether motor traffic runs on lanes of this type in one direction."""
+    return _TYPES.get(lane.type.lower()) in DRIVABLE
+
+
+def runs_forward(road: RawRoad, lane: RawLane) -> bool:
+    """Whether traffic runs towards larger s."""
     forward = (lane.id < 0) != road.left_hand
     return not forward if lane.forward_sign == 1 else forward
 

@@ -24,11 +24,9 @@ from limsim_jax.maps.network import (
     Movement,
     Turn,
 )
+from limsim_jax.maps.opendrive.completion import End, Stated, complete
 from limsim_jax.maps.opendrive.lanes import MIN_SECTION, MIN_WIDTH, LaneKey, Piece, lane_id
 from limsim_jax.maps.opendrive.records import RawConnection, RawJunction, RawRoad, RoadLink
-
-# an end of a lane record of the file: road, section index, lane number, "start" or "end" in road s
-End = tuple[str, int, int, str]
 
 BEND = 40.0  # m; traffic that turns at a junction drives tighter than this
 
@@ -56,6 +54,7 @@ class Linker:
         self.roads, self.junctions, self.pieces = roads, junctions, pieces
         self.piece_at, self.lanes, self.report = piece_at, lanes, report
         self.contacts: dict[tuple[End, End], _Contact] = {}
+        self.stated: list[Stated] = []
         self.through: dict[tuple[str, str], set[str]] = defaultdict(set)  # lane pair -> direct junctions
 
     def run(self) -> None:
@@ -67,6 +66,8 @@ class Linker:
         for junction in self.junctions.values():
             for connection in junction.connections:
                 self._connection(junction, connection)
+        for a, b, link in list(complete(self.stated, self.contacts, self.roads, self.report)):
+            self._touch(a, b, link.line, link.junction)
         self._pass_through_dropped()
         self._direct_edges()
         self._neighbours()
@@ -95,6 +96,9 @@ class Linker:
     def _within(self, road: RawRoad) -> None:
         for k, section in enumerate(road.sections[:-1]):
             following = road.sections[k + 1]
+            where = f"road {road.id} s={following.s:g}"
+            first, second = (road.id, k, "end"), (road.id, k + 1, "start")
+            self.stated.append(Stated(first=first, second=second, where=where, line=following.line))
             for number, lane in section.lanes.items():
                 for other in lane.successors:
                     if number and other:
@@ -119,6 +123,11 @@ class Linker:
         other = self.roads[link.id]
         section = 0 if end == "start" else len(road.sections) - 1
         contact = link.contact
+        if link.s is None:
+            contact = contact or self._nearest_end(road, end, other, where, link)
+            index = 0 if contact == "start" else len(other.sections) - 1
+            first, second = (road.id, section, end), (other.id, index, contact)
+            self.stated.append(Stated(first=first, second=second, where=where, line=link.line))
         for number, lane in road.sections[section].lanes.items():
             for target in lane.predecessors if end == "start" else lane.successors:
                 if not number or not target:
@@ -127,7 +136,6 @@ class Linker:
                 if link.s is not None:
                     self._touch_inside(mine, other, target, link)
                     continue
-                contact = contact or self._nearest_end(road, end, other, where, link)
                 index = 0 if contact == "start" else len(other.sections) - 1
                 self._touch(mine, (other.id, index, target, contact), lane.line)
 
@@ -192,13 +200,23 @@ class Linker:
                 )  # fmt: skip
         own = 0 if connection.contact == "start" else len(connecting.sections) - 1
         theirs = 0 if end == "start" else len(incoming.sections) - 1
+        direct = junction.id if junction.type == "direct" or connecting.junction is None else None
+        self.stated.append(
+            Stated(
+                first=(incoming.id, theirs, end),
+                second=(connecting.id, own, connection.contact),
+                where=f"{where} road {incoming.id} to road {connecting.id}",
+                line=connection.line,
+                junction=direct,
+            )
+        )
         for a, b in links:
             if a and b:
                 self._touch(
                     (incoming.id, theirs, a, end),
                     (connecting.id, own, b, connection.contact),
                     connection.line,
-                    junction.id if junction.type == "direct" else None,
+                    direct,
                 )
 
     def _end_at_junction(

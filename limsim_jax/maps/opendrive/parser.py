@@ -1,13 +1,16 @@
 """Elements of an OpenDRIVE file to plain records.
 
-Every child element is either taken or counted as ignored, so that the import report can name it.
+Every child element is either taken or counted as ignored, so that the import report can name it. A broken
+record that a map can do without costs that record; broken ids and broken geometry refuse the map.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
-from limsim_jax.maps.network import ImportReport
+from limsim_jax.maps.network import ImportReport, MapError
 from limsim_jax.maps.opendrive.curves import Cubics, Geometry, Kind, ReferenceLine
 from limsim_jax.maps.opendrive.records import (
     SPEED_UNITS,
@@ -44,6 +47,9 @@ _NO_MEANING = {
     "surfaceStrip": "road surface",
 }
 
+NO_LENGTH = 1e-6
+"""Length (m) of a road that has none: it is left out, and its links pass through."""
+
 
 class Parser:
     """Elements of one file to records."""
@@ -54,6 +60,14 @@ class Parser:
     def ignore(self, element: Element) -> None:
         """Count an element, with all that is in it, as left out."""
         self.get.ignore(element, _NO_MEANING.get(element.tag, "not known to this reader"))
+
+    @contextmanager
+    def _optional(self, element: Element, where: str) -> Iterator[None]:
+        """Within it, a broken element is left out, with a note."""
+        try:
+            yield
+        except MapError as error:
+            self.report.ignored(element.tag, where, f"left out: {error.reason}", element.sourceline)
 
     # --- road -----------------------------------------------------------------------------------
 
@@ -72,8 +86,9 @@ class Parser:
             left_hand=rule == "LHT",
             line=e.sourceline,
         )
-        if road.length <= 0:
-            raise get.error(e, f"attribute 'length' is {road.length:g}: a road needs a length above zero")
+        if road.length < 0:
+            raise get.error(e, f"attribute 'length' is {road.length:g}: a road cannot be shorter than 0")
+        road.length = max(road.length, NO_LENGTH)
         if road.length > 1e6:
             raise get.error(e, f"attribute 'length' is {road.length:g}: no road is longer than 1000 km")
         self.report.read("road")
@@ -82,8 +97,9 @@ class Parser:
                 case "link":
                     self._road_links(child, road)
                 case "type":
-                    road.types.append(self._road_type(child))
-                    self.report.read("road type")
+                    with self._optional(child, f"road {road.id}"):
+                        road.types.append(self._road_type(child))
+                        self.report.read("road type")
                 case "planView":
                     road.reference = self._plan_view(child, road)
                 case "elevationProfile":
@@ -106,26 +122,39 @@ class Parser:
         return road
 
     def _road_links(self, e: Element, road: RawRoad) -> None:
-        get = self.get
         for child in e:
             if child.tag not in ("predecessor", "successor"):
                 self.ignore(child)
                 continue
-            kind = get.text(child, "elementType", "road")
-            if kind not in ("road", "junction"):
-                raise get.error(child, f"attribute 'elementType' is '{kind}', not road or junction")
-            link = RoadLink(
-                is_junction=kind == "junction",
-                id=get.text(child, "elementId"),
-                contact=get.text(child, "contactPoint", ""),
-                s=get.number(child, "elementS") if child.get("elementS") else None,
-                direction=get.text(child, "elementDir", ""),
-                line=child.sourceline,
+            with self._optional(child, f"road {road.id}"):
+                setattr(road, child.tag, self._road_link(child, road))
+                self.report.read("road link")
+
+    def _road_link(self, e: Element, road: RawRoad) -> RoadLink:
+        get = self.get
+        kind = get.text(e, "elementType", "road")
+        if kind not in ("road", "junction"):
+            raise get.error(e, f"attribute 'elementType' is '{kind}', not road or junction")
+        contact = get.text(e, "contactPoint", "")
+        if contact not in ("", "start", "end"):
+            self.report.repaired(
+                "road link",
+                f"road {road.id} {e.tag}",
+                f"contactPoint '{contact}' is not start or end: left out",
+                e.sourceline,
             )
-            if link.contact not in ("", "start", "end"):
-                raise get.error(child, f"attribute 'contactPoint' is '{link.contact}', not start or end")
-            setattr(road, child.tag, link)
-            self.report.read("road link")
+            contact = ""
+        name = get.text(e, "elementId")
+        if not name:
+            raise get.error(e, "attribute 'elementId' is empty")
+        return RoadLink(
+            is_junction=kind == "junction",
+            id=name,
+            contact=contact,
+            s=get.number(e, "elementS") if e.get("elementS") else None,
+            direction=get.text(e, "elementDir", ""),
+            line=e.sourceline,
+        )
 
     def _road_type(self, e: Element) -> tuple[float, str, float | None]:
         speed = None
@@ -187,6 +216,14 @@ class Parser:
                 raise get.error(
                     child, "has no shape: one of line, spiral, arc, poly3, paramPoly3 must stand in it"
                 )
+            if road.length <= NO_LENGTH:  # only its place counts
+                records.append(
+                    Geometry(
+                        s=0.0, x=x, y=y, heading=heading, length=NO_LENGTH, kind=Kind.CLOTHOID,
+                        line=child.sourceline,
+                    )
+                )  # fmt: skip
+                break
             if length <= 0:
                 self.report.repaired(
                     "geometry",
@@ -303,26 +340,31 @@ class Parser:
             match child.tag:
                 case "link":
                     for link in child:
-                        if link.tag == "predecessor":
-                            lane.predecessors += (get.integer(link, "id"),)
-                        elif link.tag == "successor":
-                            lane.successors += (get.integer(link, "id"),)
-                        else:
-                            self.ignore(link)
+                        with self._optional(link, where):
+                            if link.tag == "predecessor":
+                                lane.predecessors += (get.integer(link, "id"),)
+                            elif link.tag == "successor":
+                                lane.successors += (get.integer(link, "id"),)
+                            else:
+                                self.ignore(link)
                 case "width":
                     widths.append(self._cubic(child, "sOffset"))
                 case "border":
                     borders.append(self._cubic(child, "sOffset"))
                 case "roadMark":
-                    lane.marks.append(self._mark(child))
+                    with self._optional(child, where):
+                        lane.marks.append(self._mark(child))
                 case "speed":
-                    speed = self._speed(child)
-                    if speed is not None:
-                        lane.speeds.append((get.number(child, "sOffset", 0.0), speed))
+                    with self._optional(child, where):
+                        speed = self._speed(child)
+                        if speed is not None:
+                            lane.speeds.append((get.number(child, "sOffset", 0.0), speed))
                 case "access":
                     who = tuple(r.get("type", "") for r in child if r.tag == "restriction")
                     who += (child.get("restriction"),) if child.get("restriction") else ()
-                    lane.access.append((get.number(child, "sOffset", 0.0), get.text(child, "rule", ""), who))
+                    with self._optional(child, where):
+                        rule = get.text(child, "rule", "")
+                        lane.access.append((get.number(child, "sOffset", 0.0), rule, who))
                 case _:
                     self.ignore(child)
         if widths:
@@ -380,66 +422,70 @@ class Parser:
         ]
 
     def _signals(self, e: Element, road: RawRoad) -> None:
-        get = self.get
         for child in e:
             if child.tag not in ("signal", "signalReference"):
                 self.ignore(child)
                 continue
-            reference = child.tag == "signalReference"
-            value = child.get("value")
-            signal = RawSignal(
-                id=get.text(child, "id"),
-                s=get.number(child, "s"),
-                t=get.number(child, "t", 0.0),
-                z=get.number(child, "zOffset", 0.0),
-                orientation=get.text(child, "orientation", "none"),
-                validity=self._validity(child),
-                reference=reference,
-                name=get.text(child, "name", ""),
-                type=get.text(child, "type", ""),
-                subtype=get.text(child, "subtype", ""),
-                country=get.text(child, "country", "").upper(),
-                dynamic=get.text(child, "dynamic", "no").lower() in ("yes", "true"),
-                value=get.number(child, "value") if value is not None and value.strip() else None,
-                unit=get.text(child, "unit", ""),
-                heading_offset=get.number(child, "hOffset", 0.0),
-                line=child.sourceline,
-            )
-            road.signals.append(signal)
-            self.report.read("signalReference" if reference else "signal")
-            for inner in child:
-                if inner.tag != "validity":
-                    self.ignore(inner)
+            with self._optional(child, f"road {road.id}"):
+                road.signals.append(self._signal(child))
+                self.report.read(child.tag)
+                for inner in child:
+                    if inner.tag != "validity":
+                        self.ignore(inner)
+
+    def _signal(self, e: Element) -> RawSignal:
+        get = self.get
+        value = e.get("value")
+        return RawSignal(
+            id=get.text(e, "id"),
+            s=get.number(e, "s"),
+            t=get.number(e, "t", 0.0),
+            z=get.number(e, "zOffset", 0.0),
+            orientation=get.text(e, "orientation", "none"),
+            validity=self._validity(e),
+            reference=e.tag == "signalReference",
+            name=get.text(e, "name", ""),
+            type=get.text(e, "type", ""),
+            subtype=get.text(e, "subtype", ""),
+            country=get.text(e, "country", "").upper(),
+            dynamic=get.text(e, "dynamic", "no").lower() in ("yes", "true"),
+            value=get.number(e, "value") if value is not None and value.strip() else None,
+            unit=get.text(e, "unit", ""),
+            heading_offset=get.number(e, "hOffset", 0.0),
+            line=e.sourceline,
+        )
 
     def _objects(self, e: Element, road: RawRoad) -> None:
-        get = self.get
         for child in e:
             if child.tag != "object":
                 self.ignore(child)
                 continue
-            raw = RawObject(
-                id=get.text(child, "id", ""),
-                type=get.text(child, "type", "").lower(),
-                subtype=get.text(child, "subtype", "").lower(),
-                name=get.text(child, "name", ""),
-                s=get.number(child, "s", 0.0),
-                t=get.number(child, "t", 0.0),
-                z=get.number(child, "zOffset", 0.0),
-                heading=get.number(child, "hdg", 0.0),
-                length=get.number(child, "length", 0.0),
-                width=get.number(child, "width", 0.0),
-                height=get.number(child, "height", 0.0),
-                outlines=[self._outline(o, road) for o in child.iter("outline")],
-                validity=self._validity(child),
-                line=child.sourceline,
-            )
-            raw.outlines = [outline for outline in raw.outlines if len(outline) >= 2]
-            road.objects.append(raw)
-            for inner in child:
-                if inner.tag not in ("outline", "outlines", "validity"):
-                    self.ignore(inner)
+            with self._optional(child, f"road {road.id}"):
+                road.objects.append(self._object(child))
+                for inner in child:
+                    if inner.tag not in ("outline", "outlines", "validity"):
+                        self.ignore(inner)
 
-    def _outline(self, e: Element, road: RawRoad) -> list[tuple[bool, float, float]]:
+    def _object(self, e: Element) -> RawObject:
+        get = self.get
+        return RawObject(
+            id=get.text(e, "id", ""),
+            type=get.text(e, "type", "").lower(),
+            subtype=get.text(e, "subtype", "").lower(),
+            name=get.text(e, "name", ""),
+            s=get.number(e, "s", 0.0),
+            t=get.number(e, "t", 0.0),
+            z=get.number(e, "zOffset", 0.0),
+            heading=get.number(e, "hdg", 0.0),
+            length=get.number(e, "length", 0.0),
+            width=get.number(e, "width", 0.0),
+            height=get.number(e, "height", 0.0),
+            outlines=[points for o in e.iter("outline") if len(points := self._outline(o)) >= 2],
+            validity=self._validity(e),
+            line=e.sourceline,
+        )
+
+    def _outline(self, e: Element) -> list[tuple[bool, float, float]]:
         corners = []
         for child in e:
             if child.tag == "cornerRoad":
@@ -463,17 +509,21 @@ class Parser:
             line=e.sourceline,
         )
         self.report.read("junction")
+        where = f"junction {junction.id}"
         for child in e:
             match child.tag:
                 case "connection":
-                    self._connection(child, junction)
+                    with self._optional(child, where):
+                        self._connection(child, junction)
                 case "priority":
-                    junction.priorities.append(
-                        (get.text(child, "high"), get.text(child, "low"), child.sourceline)
-                    )
+                    with self._optional(child, where):
+                        junction.priorities.append(
+                            (get.text(child, "high"), get.text(child, "low"), child.sourceline)
+                        )
                 case "controller":
-                    junction.controllers.append(get.text(child, "id"))
-                    self.report.read("junction controller")
+                    with self._optional(child, where):
+                        junction.controllers.append(get.text(child, "id"))
+                        self.report.read("junction controller")
                 case _:
                     self.ignore(child)
         return junction
@@ -486,10 +536,12 @@ class Parser:
         contact = get.text(e, "contactPoint", "start")
         if contact not in ("start", "end"):
             raise get.error(e, f"attribute 'contactPoint' is '{contact}', not start or end")
-        links = []
+        where = f"junction {junction.id} road {road}"
+        links: list[tuple[int, int]] = []
         for child in e:
             if child.tag == "laneLink":
-                links.append((get.integer(child, "from"), get.integer(child, "to")))
+                with self._optional(child, where):
+                    links.append((get.integer(child, "from"), get.integer(child, "to")))
             elif child.tag not in ("predecessor", "successor"):  # virtual junctions: roads say the same
                 self.ignore(child)
         junction.connections.append(
@@ -506,18 +558,22 @@ class Parser:
 
     def controller(self, e: Element) -> RawController:
         """A `<controller>`."""
-        signals = []
+        name = self.get.text(e, "id")
+        signals: list[str] = []
         for child in e:
             if child.tag == "control":
-                signals.append(self.get.text(child, "signalId"))
+                with self._optional(child, f"controller {name}"):
+                    signals.append(self.get.text(child, "signalId"))
             else:
                 self.ignore(child)
         self.report.read("controller")
-        sequence = e.get("sequence")
+        sequence: int | None = None
+        with self._optional(e, f"controller {name}"):
+            sequence = self.get.integer(e, "sequence", None)
         return RawController(
-            id=self.get.text(e, "id"),
+            id=name,
             name=self.get.text(e, "name", ""),
-            sequence=self.get.integer(e, "sequence") if sequence and sequence.strip() else None,
+            sequence=sequence,
             signals=tuple(dict.fromkeys(signals)),
             line=e.sourceline,
         )

@@ -11,9 +11,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from limsim_jax.maps.bridges import bridge_lanes, bridge_roads
 from limsim_jax.maps.check import GAP, KINK, seams
 from limsim_jax.maps.network import ImportReport, Lane, MapError, Network, Road
-from limsim_jax.maps.opendrive.furniture import Furnisher, extend_lights, regulate
+from limsim_jax.maps.opendrive.furniture import Furnisher, extend_lights, fit_arrows, regulate
 from limsim_jax.maps.opendrive.lanes import Cutter, Piece, lane_id, sample_piece
 from limsim_jax.maps.opendrive.links import Linker, build_movements
 from limsim_jax.maps.opendrive.parser import Parser
@@ -94,12 +95,28 @@ def read_opendrive(path: str | Path) -> Network:
 
     linker = Linker(roads, junctions, pieces, cutter.piece_at, lanes, report)
     linker.run()
+    made, cut = bridge_lanes(lanes, {pair: min(names) for pair, names in linker.through.items()}, report)
+    for pair in (*made, *cut):
+        linker.through.pop(pair, None)
     _connector_speeds(lanes, pieces, roads, report)
     movements, junction_records = build_movements(lanes, junctions, linker.through, report)
     furniture = Furnisher(roads, pieces, lanes, movements, controllers, report).run()
     furniture.lights = extend_lights(furniture.lights, movements, lanes, report)
+    furniture.lights = fit_arrows(furniture.lights, movements, lanes, report)
     movements = regulate(movements, lanes, furniture.lights, furniture.signs, report)
     reader.ignored.summarise(report)
+    road_records = {
+        road.id: Road(
+            id=road.id,
+            name=road.name,
+            type=road.types[0][1] if road.types else "",
+            length=road.length,
+            junction=road.junction,
+            left_hand=road.left_hand,
+            line=road.line,
+        )
+        for road in raw_roads
+    }
     network = Network(
         name=name or path.name.partition(".")[0],
         source=str(path),
@@ -107,18 +124,7 @@ def read_opendrive(path: str | Path) -> Network:
         format=f"OpenDRIVE {version}",
         geo_reference=geo_reference,
         lanes=lanes,
-        roads={
-            road.id: Road(
-                id=road.id,
-                name=road.name,
-                type=road.types[0][1] if road.types else "",
-                length=road.length,
-                junction=road.junction,
-                left_hand=road.left_hand,
-                line=road.line,
-            )
-            for road in raw_roads
-        },
+        roads=road_records | bridge_roads(road_records, lanes, made),
         movements=movements,
         junctions=junction_records,
         traffic_lights=tuple(furniture.lights),

@@ -299,6 +299,9 @@ class Elements:
         if via is not None and via not in self.lanes:
             raise xml.error(element, f"there is no lane via='{via}'")
         light = xml.text(element, "tl", None) or None
+        link = xml.integer(element, "linkIndex") if light else None
+        if link is not None and link < 0:  # tracks at a level crossing: their signals are elsewhere
+            light = link = None
         connection = Connection(
             source=self._lane_of(element, "from", "fromLane"),
             target=self._lane_of(element, "to", "toLane"),
@@ -307,12 +310,10 @@ class Elements:
             control=xml.choice(element, "state", CONTROLS),
             via=self.lanes[via] if via else None,
             light=light,
-            link=xml.integer(element, "linkIndex") if light else None,
+            link=link,
             keep_clear=xml.flag(element, "keepClear", True),
             allowed=self._permissions(element),
         )
-        if connection.link is not None and connection.link < 0:
-            raise xml.error(element, "linkIndex is negative")
         xml.text(element, "uncontrolled", None)  # the light of the junction does not control it: it has no tl
         if connection.via is None and connection.allowed != VEHICLE_CLASSES:
             message = "no lane inside the junction that could carry its permissions"

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from limsim_jax.maps.bridges import bridge
 from limsim_jax.maps.network import ImportReport, Network, Road
 from limsim_jax.maps.sumo.crosswalks import build_crosswalks
 from limsim_jax.maps.sumo.elements import Elements, FileEdge
@@ -43,7 +44,7 @@ def read_sumo(path: str | Path, additional: Iterable[str | Path] = ()) -> Networ
     noted = {note.where for note in report.notes if note.element == "lane"}
     report.read("lane", len(lanes) - len(noted))
     xml.ignored.summarise(report)
-    return Network(
+    network = Network(
         name=re.sub(r"(\.net)?\.xml(\.gz)?$", "", Path(path).name),
         source=str(path),
         file_hash=file_hash(data),
@@ -59,6 +60,7 @@ def read_sumo(path: str | Path, additional: Iterable[str | Path] = ()) -> Networ
         crosswalks=crosswalks,
         report=report,
     )
+    return bridge(network)
 
 
 def _road(elements: Elements, edge: FileEdge) -> Road:

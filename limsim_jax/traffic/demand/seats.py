@@ -18,6 +18,7 @@ from limsim_jax.maps.lane_map import (
 )
 from limsim_jax.maps.network import Lane
 from limsim_jax.traffic.demand.tables import Tables, cumulative
+from limsim_jax.traffic.vehicles import SIDE_ROOM
 
 EGO_ROOM = 10.0
 """m before and behind an ego that are free on its lane at the start."""
@@ -115,7 +116,7 @@ def _fits(
     rear = s - tables.lengths[1]
     along = rear[:, None] + share * (s + slack - rear)[:, None]
     width = [by_row[r].width_at(x).min() for r, x in zip(row.tolist(), along, strict=True)]
-    return np.reshape(width, (-1, 1)) >= tables.widths + 0.2
+    return np.reshape(width, (-1, 1)) >= tables.widths + SIDE_ROOM
 
 
 def _apart(
@@ -128,6 +129,8 @@ def _apart(
 
     Bodies may have any size, and be anywhere in their place.
     """
+    if not len(s):
+        return np.ones(0, bool)
     by_row = {tables.rows[lane.id]: lane for lane in tables.network.drivable_lanes()}
     lengths = np.linspace(*tables.lengths, 3)
     share = np.linspace(0, 1, 3)
@@ -138,11 +141,9 @@ def _apart(
     poses = [by_row[r].pose(x) for r, x in zip(row.tolist(), center, strict=True)]
     xy = np.array([p[0][:, :2] for p in poses]).reshape(-1, 2)
     heading = np.array([p[1] for p in poses]).reshape(-1, 1)
-    boxes = np.concatenate(
-        [xy - xy.mean(0, keepdims=True) if len(xy) else xy, heading, size.reshape(-1, 2)], 1
-    )
+    boxes = np.concatenate([xy - xy.mean(0, keepdims=True), heading, size.reshape(-1, 2)], 1)
     reach = math.hypot(tables.lengths[1], tables.widths.max()) + 0.1
-    pairs = KDTree(xy).query_pairs(reach, output_type="ndarray") if len(xy) else np.zeros((0, 2), int)
+    pairs = KDTree(xy).query_pairs(reach, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 9 != pairs[:, 1] // 9]
     padded = np.zeros((bucket(len(pairs), 1024), 2), int)
     padded[: len(pairs)] = pairs

@@ -14,6 +14,7 @@ from limsim_jax.maps.lane_map import (
     lane_rows,
 )
 from limsim_jax.maps.network import Network
+from limsim_jax.maps.routing import Round
 from limsim_jax.traffic.vehicles import PARAMETERS, Population
 
 CHANGE_ROOM, CHANGE_TIME = 60.0, 6.0
@@ -51,10 +52,11 @@ class Tables:
         `common` are the goals of traffic without one of its own; None: all.
         Raises `ValueError` if the goals do not fit."""
         rows = lane_rows(network)
-        is_goal = np.asarray(lane_map.routes.is_goal)
+        is_goal, reachable = (np.asarray(x) for x in (lane_map.routes.is_goal, lane_map.routes.reachable))
         for column, (name, lanes) in enumerate(goals.items()):
             ends = [rows[lane] for lane in lanes if lane in rows]
-            if column >= is_goal.shape[1] or not ends or not is_goal[ends, column].all():
+            there = reachable if isinstance(lanes, Round) else is_goal
+            if column >= there.shape[1] or not ends or not there[ends, column].all():
                 raise ValueError(
                     f"goal '{name}' is not number {column} of the lane map, which has other goals"
                 )
