@@ -29,9 +29,9 @@ from limsim_jax.maps.signals import lane_states
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweeps.build import plain_demand
+from limsim_jax.traffic.bodies import tails
 from limsim_jax.traffic.demand import sample_scenario
 from limsim_jax.traffic.engine import Tick, Traffic
-from limsim_jax.traffic.motion import tails
 from limsim_jax.types import Config, State, Status
 from limsim_jax.xla import use_all_cores
 

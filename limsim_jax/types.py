@@ -200,6 +200,7 @@ class State:
     vehicle: Int[Array, " N"]  # row of the schedule, -1 for vehicles that were there at the start
     lane: Int[Array, " N"]
     previous: Int[Array, " N"]  # lane before `lane`, on which the tail may still be
+    earlier: Int[Array, "N P"]  # lanes before `previous`, the latest first; NO_LANE where not known
     s: Float[Array, " N"]  # m, front bumper along the lane
     d: Float[Array, " N"]  # m, offset of the vehicle from the centre of the lane, left > 0
     v: Float[Array, " N"]  # m/s

@@ -161,6 +161,7 @@ class PolicyPilot:
             return state
         mine = me == ego.slot
         names = "lane", "previous", "s", "d", "v", "a", "side", "distance"
+        state = replace(state, earlier=jnp.where(mine[:, None], own.earlier[:1], state.earlier))
         known = {n: jnp.where(mine, getattr(own, n)[0], getattr(state, n)) for n in names}
         return replace(state, egos=replace(own.egos, slot=slot), **known)
 

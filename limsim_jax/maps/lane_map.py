@@ -47,6 +47,9 @@ Index = Int[Array, "*#b"] | Int[np.ndarray, "*#b"] | int
 Number = Float[Array, "*#b"] | Float[np.ndarray, "*#b"] | float
 Goals = Sequence[Sequence[str]] | Mapping[str, Sequence[str]]
 
+EARLIER = 3
+"""Lanes that a vehicle remembers beyond its own and the one before."""
+
 VEHICLE_CLASSES = ("car", "van", "truck", "bus", "motorcycle", "emergency")
 """Vehicle classes in the order of the bits of `LaneMap.access`."""
 
@@ -103,6 +106,10 @@ class LaneMap:
     signals: SignalTable
     lanes_in_sight: int = struct.field(pytree_node=False, default=0)
     """Lanes that a vehicle may have to scan to see `rasterise.SIGHT` m ahead."""
+    lanes_behind: int = struct.field(pytree_node=False, default=2)
+    """Lanes behind its own on which a vehicle may have its tail."""
+    approaches: int = struct.field(pytree_node=False, default=3)
+    """Connectors that a vehicle looks at: those of a way across a junction, and two more."""
 
 
 def lane_rows(network: Network) -> dict[str, int]:

@@ -22,6 +22,7 @@ from limsim_jax.maps.bridges import goes_on_beside, side_step
 from limsim_jax.maps.conflicts import build_conflicts
 from limsim_jax.maps.lane_map import (
     CELL,
+    EARLIER,
     LANE_TYPES,
     NO_LANE,
     REACH,
@@ -53,6 +54,12 @@ TURN_WINDOW = 4.0
 
 SIGHT = 50.0
 """Distance that every vehicle must see ahead, m: to stop from 70 km/h with 4 m/s^2."""
+
+LONGEST = 20.0
+"""Length of the longest vehicle, m."""
+
+MOST_PIECES = 8
+"""Connectors of one way across a junction, at most, that vehicles look at."""
 
 _MOST = 12  # lanes that a vehicle scans, at most
 _BESIDE = 500.0  # m, beyond which it does not matter how far lanes run side by side
@@ -149,7 +156,11 @@ def build_lane_map(
     }
     sight = max(_lanes_in_sight(lanes, lane_rows(network)), _LEAST["sight"])
     lane_map = LaneMap(
-        **arrays, **_rule_tables(network, goals, routes or {}, num_lanes), lanes_in_sight=sight
+        **arrays,
+        **_rule_tables(network, goals, routes or {}, num_lanes),
+        lanes_in_sight=sight,
+        lanes_behind=_lanes_behind(lanes, lane_rows(network)),
+        approaches=_approaches(network),
     )
     return jax.tree.map(lambda array: jnp.asarray(_device_type(array)), lane_map)
 
@@ -342,6 +353,28 @@ def _beside(lanes: list[Lane], rows: Mapping[str, int], side: Literal["left", "r
                 found[row] = length[row] + min(_BESIDE, *(found[k] if k >= 0 else 0.0 for k in after))
         if (found == before).all():
             return found
+
+
+def _lanes_behind(lanes: list[Lane], rows: Mapping[str, int]) -> int:
+    """Lanes behind its own that the longest vehicle can reach, at least 2."""
+    before = [[rows[name] for name in lane.predecessors if name in rows] for lane in lanes]
+    short = [row for row, lane in enumerate(lanes) if lane.length < LONGEST]
+    reach = {row: lanes[row].length for row in short}  # m, least length of a chain that ends there
+    for count in range(2, EARLIER + 1):
+        further: dict[int, float] = {}
+        for row, length in reach.items():
+            for other in before[row]:
+                further[other] = min(further.get(other, math.inf), length + lanes[other].length)
+        reach = {row: length for row, length in further.items() if length < LONGEST}
+        if not reach:
+            return count
+    return EARLIER + 1
+
+
+def _approaches(network: Network) -> int:
+    """Connectors that vehicles look at: as many as a way across a junction has, and two more."""
+    pieces = max((sum(network.lanes[x].drivable for x in m.via) for m in network.movements), default=1)
+    return min(max(pieces, 1), MOST_PIECES) + 2
 
 
 def _taper(lane: Lane) -> float:

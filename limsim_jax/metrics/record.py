@@ -17,10 +17,11 @@ from limsim_jax.maps.signals import lane_states
 from limsim_jax.metrics.safety import NO_GAP, Zones
 from limsim_jax.metrics.step import EgoStep
 from limsim_jax.metrics.traffic import TrafficStep
+from limsim_jax.traffic.bodies import body_place, tails
 from limsim_jax.traffic.collision import CLEARANCE, level, off_road
-from limsim_jax.traffic.ego import arrived, body_place
+from limsim_jax.traffic.ego import arrived
 from limsim_jax.traffic.engine import Tick
-from limsim_jax.traffic.motion import boxes, tails
+from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, State, Status
 
 AT_RED = 15.0
@@ -90,12 +91,12 @@ def ego_step(
     box = boxes(lane_map, state)
     z = level(lane_map, state)
     seen = state.active & (jnp.abs(z - z[slot]) < CLEARANCE)  # a vehicle on a bridge is out of reach
-    lane, s, v = state.lane[slot], state.s[slot], state.v[slot]
+    lane, v = state.lane[slot], state.v[slot]
     following = lane_map.routes.next_lane[lane, state.goal[slot]]
     signals = _signals(lane_map, snapshot, slot, following)
 
     # the road at the ego
-    at, at_s = body_place(lane_map, lane, state.previous[slot], s, state.shape.length[slot])
+    at, at_s = (x[0] for x in body_place(lane_map, state, slot[None]))
     heading = pose(lane_map, at, at_s)[2]
     half = width(lane_map, state.lane, state.s) / 2
     straddles = jnp.abs(state.d) + state.shape.width / 2 > half

@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, neighbor, pose, side_s, width
-from limsim_jax.traffic.ego import Trajectory, body_place
+from limsim_jax.traffic.bodies import body_place
+from limsim_jax.traffic.ego import Trajectory
 from limsim_jax.traffic.motion import lateral_speed
 from limsim_jax.types import State
 from limsim_jax.xla import interval
@@ -167,9 +168,7 @@ def reference_path(
 
 def center_lane(lane_map: LaneMap, state: State, slot: Int[Array, " V"]) -> tuple[Array, Array]:
     """Lane and arc length (m) of the centres of these bodies."""
-    return body_place(
-        lane_map, state.lane[slot], state.previous[slot], state.s[slot], state.shape.length[slot]
-    )
+    return body_place(lane_map, state, slot)
 
 
 def beside(

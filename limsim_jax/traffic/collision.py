@@ -26,7 +26,8 @@ from limsim_jax.maps.lane_map import (
     to_frenet,
     width,
 )
-from limsim_jax.traffic.ego import at_slots, body_place
+from limsim_jax.traffic.bodies import body_place
+from limsim_jax.traffic.ego import at_slots
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, State, Status
 from limsim_jax.xla import computed_once
@@ -225,9 +226,7 @@ class _Section(NamedTuple):
 
 def _section(lane_map: LaneMap, state: State) -> _Section:
     slot = state.egos.slot
-    lane, s = body_place(
-        lane_map, state.lane[slot], state.previous[slot], state.s[slot], state.shape.length[slot]
-    )
+    lane, s = body_place(lane_map, state, slot)
     one = jnp.ones_like(lane)
     return _Section(
         lane,

@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from limsim_jax.geometry import direction, wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, pose, project, side_s, to_frenet, width
 from limsim_jax.numerics import safe_divide, safe_norm
+from limsim_jax.traffic.bodies import body_place
 from limsim_jax.traffic.car_following import ballistic
 from limsim_jax.types import Config, Egos, State
 from limsim_jax.xla import interval
@@ -109,6 +110,9 @@ def step_free(config: Config, lane_map: LaneMap, limits: Limits, state: State, c
         state,
         lane=write(place.lane, state.lane),
         previous=write(place.previous, state.previous),
+        earlier=jnp.where(
+            at_slots(egos, moves, jnp.zeros_like(state.active), moves)[:, None], NO_LANE, state.earlier
+        ),
         s=write(place.s, state.s),
         d=write(place.d, state.d),
         v=write(v, state.v),
@@ -161,22 +165,6 @@ class _Place(NamedTuple):
     side: Int[Array, " E"]
 
 
-def body_place(
-    lane_map: LaneMap,
-    lane: Int[Array, "*e"],
-    previous: Int[Array, "*e"],
-    s: Float[Array, "*e"],
-    length: Array,
-) -> tuple[Int[Array, "*e"], Float[Array, "*e"]]:
-    """Lane and arc length (m) of the centre of a body.
-
-    `s`: front bumper (m).
-    """
-    s = s - length / 2
-    behind = (s < 0) & (previous != NO_LANE)
-    return jnp.where(behind, previous, lane), jnp.where(behind, s + lane_map.length[previous], s)
-
-
 def _find_lane(
     lane_map: LaneMap, state: State, x: Array, y: Array, heading: Array, distance: Array
 ) -> _Place:
@@ -184,7 +172,7 @@ def _find_lane(
     slot = state.egos.slot
     length, breadth = state.shape.length[slot], state.shape.width[slot]
     was, was_before, goal = state.lane[slot], state.previous[slot], state.goal[slot]
-    start, s = body_place(lane_map, was, was_before, state.s[slot], length)
+    start, s = body_place(lane_map, state, slot)
     here = lax.stop_gradient((x, y, heading))
     *_, along = pose(lane_map, start, s)
     s = lax.stop_gradient(s + distance * jnp.cos(heading - along))
@@ -379,8 +367,8 @@ def sync(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> State:
     Their wheels point along the lane, so an ego may be set free at any moment. `box`: `motion.boxes`.
     """
     egos, slot = state.egos, state.egos.slot
-    length, wheelbase = state.shape.length[slot], state.shape.wheelbase[slot]
-    lane, s = body_place(lane_map, state.lane[slot], state.previous[slot], state.s[slot], length)
+    wheelbase = state.shape.wheelbase[slot]
+    lane, s = body_place(lane_map, state, slot)
     wheels = jnp.arctan(wheelbase * curvature(lane_map, lane, s))
 
     def bound(new: Array, old: Array) -> Array:

@@ -19,6 +19,7 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, room_beside
 from limsim_jax.maps.routing import NO_ROOM
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import lane_states
+from limsim_jax.traffic.bodies import tails
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
 from limsim_jax.traffic.collision import AfterCollision, after_collision
 from limsim_jax.traffic.collision import record as record_events
@@ -39,7 +40,7 @@ from limsim_jax.traffic.ego import (
     with_free,
 )
 from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, side_to_look, start
-from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes, tails, without
+from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes, without
 from limsim_jax.traffic.neighbors import (
     Ahead,
     Obstacles,

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from limsim_jax.geometry import polynomial
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, width
 from limsim_jax.numerics import safe_divide
+from limsim_jax.traffic.bodies import body_place
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing, ballistic
 from limsim_jax.traffic.ego import overlay_boxes
 from limsim_jax.traffic.neighbors import Obstacles
@@ -102,9 +103,9 @@ def advance(
     v, dx = computed_once(ballistic(state.v, a, config.dt))
     realised = (v - state.v) / config.dt
     hard = realised < -state.driver.b_max - 0.01
-    lane, previous, s, left = _hand_over(lane_map, state, computed_once(state.s + dx))
+    moved, left = _hand_over(lane_map, state, computed_once(state.s + dx))
     state = replace(
-        without(replace(state, lane=lane, previous=previous, s=s, v=v, a=realised), left),
+        without(replace(moved, v=v, a=realised), left),
         distance=state.distance + dx,
         waiting=jnp.where(state.active & (v < DRIVING.walking_speed), state.waiting + config.dt, 0),
         rest=jnp.maximum(state.rest - config.dt, 0),
@@ -119,6 +120,7 @@ def without(state: State, left: Bool[Array, " N"]) -> State:
         state,
         lane=jnp.where(left, NO_LANE, state.lane),
         previous=jnp.where(left, NO_LANE, state.previous),
+        earlier=jnp.where(left[:, None], NO_LANE, state.earlier),
         s=jnp.where(left, 0, state.s),
         v=jnp.where(left, 0, state.v),
         a=jnp.where(left, 0, state.a),
@@ -126,13 +128,11 @@ def without(state: State, left: Bool[Array, " N"]) -> State:
     )
 
 
-def _hand_over(
-    lane_map: LaneMap, state: State, s: Float[Array, " N"]
-) -> tuple[Int[Array, " N"], Int[Array, " N"], Float[Array, " N"], Bool[Array, " N"]]:
-    """Move vehicles beyond the end of their lane to the next lane."""
+def _hand_over(lane_map: LaneMap, state: State, s: Float[Array, " N"]) -> tuple[State, Bool[Array, " N"]]:
+    """Move vehicles beyond the end of their lane to the next lane, with front bumpers at `s` (m)."""
     routes = lane_map.routes
     way = jnp.where(routes.is_goal, _GOAL, routes.next_lane)  # one look-up instead of two
-    lane, previous = state.lane, state.previous
+    lane, previous, earlier = state.lane, state.previous, state.earlier
     left = jnp.zeros_like(state.active)
     for _ in range(_HAND_OVERS):
         length = lane_map.length[lane]
@@ -141,11 +141,13 @@ def _hand_over(
         gone = over & (following == _GOAL)
         go_on = over & (following >= 0)
         left = left | gone
+        shifted = jnp.concatenate([previous[:, None], earlier[:, :-1]], -1)
+        earlier = jnp.where(go_on[:, None], shifted, earlier)
         previous = jnp.where(go_on, lane, previous)
         s = jnp.where(go_on, s - length, s)
         lane = jnp.where(go_on, following, lane)
-        lane, previous, s, left = computed_once((lane, previous, s, left))
-    return lane, previous, s, left
+        lane, previous, earlier, s, left = computed_once((lane, previous, earlier, s, left))
+    return replace(state, lane=lane, previous=previous, earlier=earlier, s=s), left
 
 
 def smooth_step(u: Float[Array, "*b"]) -> Float[Array, "*b"]:
@@ -197,6 +199,7 @@ def _move_sideways(config: Config, lane_map: LaneMap, state: State) -> State:
             jnp.where(state.side > 0, lane_map.left[state.previous], lane_map.right[state.previous]),
             state.previous,
         ),
+        earlier=jnp.where(crosses[:, None], NO_LANE, state.earlier),
         s=jnp.where(crosses, s_beside, state.s),
         d=jnp.where(
             changing,
@@ -218,42 +221,14 @@ def lateral_speed(state: State) -> Float[Array, " N"]:
     return jnp.where(state.side != 0, -state.shift * slope * rate, 0)
 
 
-def tails(
-    lane_map: LaneMap, state: State, beyond: float = 0.0
-) -> tuple[Int[Array, "N 2"], Float[Array, "N 2"]]:
-    """Lanes behind its own on which a vehicle still has its tail.
-
-    Lanes may be shorter than vehicles, so these are the lane behind and the one behind that. Where several
-    lanes lead there, it is not known from which of them the vehicle came.
-
-    Args:
-      lane_map: where.
-      state: the world.
-      beyond: m past the end of a lane, up to which a tail counts as on it.
-
-    Returns:
-      The lanes, NO_LANE where there is no tail, and the front bumper along them (m).
-    """
-    one = (lane_map.predecessors != NO_LANE).sum(-1) == 1
-    behind = jnp.where(one[state.previous], lane_map.predecessors[state.previous, 0], NO_LANE)
-    lane = jnp.stack([state.previous, jnp.where(state.previous == NO_LANE, NO_LANE, behind)], -1)
-    length = lane_map.length[lane]
-    front = state.s[:, None] + jnp.cumsum(length, -1)
-    there = state.active[:, None] & (front - length < state.shape.length[:, None] + beyond)
-    return jnp.where(there, lane, NO_LANE), front
-
-
 def boxes(lane_map: LaneMap, state: State) -> Float[Array, "N 5"]:
     """Oriented boxes: x, y (m) of the centre, heading (rad), length, width (m).
 
-    The body lies on the lane at its centre, half a length behind the front bumper, which may be on the
-    lane before; it is turned by the direction of its motion. Free egos are where they are in the plane.
+    The body lies on the lane at its centre, half a length behind the front bumper, which may be on a
+    lane behind; it is turned by the direction of its motion. Free egos are where they are in the plane.
     """
     shape = state.shape
-    s = state.s - shape.length / 2
-    behind = (s < 0) & (state.previous != NO_LANE)
-    lane = jnp.where(behind, state.previous, state.lane)
-    s = jnp.where(behind, s + lane_map.length[state.previous], s)
+    lane, s = body_place(lane_map, state)
     x, y, heading = pose(lane_map, lane, s, state.d)
     slope = jnp.clip(lateral_speed(state) / jnp.maximum(state.v, 0.5), -_STEEPEST, _STEEPEST)
     turned = slope * polynomial((1, -1 / 3, 1 / 5, -1 / 7), slope * slope)  # the arc tangent, to 1e-7

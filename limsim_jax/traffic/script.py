@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose
 from limsim_jax.numerics import safe_norm
-from limsim_jax.traffic.ego import Limits, body_place
+from limsim_jax.traffic.bodies import body_place
+from limsim_jax.traffic.ego import Limits
 from limsim_jax.traffic.motion import Decision
 from limsim_jax.traffic.parameters import DRIVING
 from limsim_jax.types import Actions, Config, Driver, Order, Progress, Schedule, State, Zones
@@ -58,8 +59,7 @@ def _to_ego(lane_map: LaneMap, actions: Actions, state: State) -> Float[Array, "
         return jnp.full_like(actions.at, jnp.inf)
 
     def middle(slot: Array) -> tuple[Array, Array]:
-        length = state.shape.length[slot]
-        lane, s = body_place(lane_map, state.lane[slot], state.previous[slot], state.s[slot], length)
+        lane, s = body_place(lane_map, state, slot)
         x, y, _ = pose(lane_map, lane, s, state.d[slot])
         return x, y
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.maps.lane_map import NO_LANE, LaneMap
+from limsim_jax.maps.lane_map import EARLIER, NO_LANE, LaneMap
 from limsim_jax.types import Driver, Egos, Lights, Queues, Shape, State
 
 
@@ -46,6 +46,7 @@ def start_state(
         vehicle=zeros - 1,
         lane=lane,
         previous=zeros + NO_LANE,
+        earlier=jnp.full((n, EARLIER), NO_LANE, jnp.int32),
         s=jnp.asarray(s, jnp.float32),
         d=zero,
         v=jnp.asarray(v, jnp.float32),

@@ -16,10 +16,11 @@ from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.network import ImportReport
 from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.metrics.record import conflict_zones
+from limsim_jax.traffic.bodies import tails
 from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.engine import Traffic, _until_changed, drive
 from limsim_jax.traffic.lane_change import place_beside
-from limsim_jax.traffic.motion import boxes, tails
+from limsim_jax.traffic.motion import advance, boxes
 from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config
 
@@ -158,13 +159,13 @@ def test_tails_reach_back_by_the_length_of_the_vehicle():
     length = state.shape.length[0]
     assert 4 < float(length) < 5.5
     lane, front = (np.asarray(x) for x in tails(lane_map, state))
-    here = [[name and rows[name] for name in pair] for pair in (
-        ("away2", "away1"), ("away", "second"), ("first", None), (None, None), ("in", None), (None, None)
-    )]  # fmt: skip
-    assert lane.tolist() == [[-1 if x is None else x for x in pair] for pair in here]
+    here = (
+        ("away2", "away1", "away", "second"), ("away", "second", "first"), ("first",), (), ("in",), ()
+    )  # fmt: skip
+    assert lane.tolist() == [[rows[x] for x in way] + [-1] * (4 - len(way)) for way in here]
     at = np.asarray(lane_map.length)
-    assert front[0].tolist() == pytest.approx([1.6, 2.6])
-    assert front[1].tolist() == pytest.approx([1.5, 1.5 + at[rows["second"]]])
+    assert front[0, :2].tolist() == pytest.approx([1.6, 2.6])
+    assert front[1, :2].tolist() == pytest.approx([1.5, 1.5 + at[rows["second"]]])
     assert front[2, 0] == pytest.approx(3.0 + at[rows["first"]])
 
 
@@ -263,3 +264,33 @@ def test_connector_in_pieces_is_followed_as_one():
     apart, v = run(state)
     assert float(apart.min()) > 0.5
     assert float(v[-1]) == 0.0
+
+
+def test_vehicles_remember_the_lanes_that_they_came_by():
+    """Behind a merge of short lanes the tail lies on the lanes that were driven, and so does the body."""
+    half = math.pi / 6
+    lanes = [
+        straight("low", (-20 * math.cos(half), -20 * math.sin(half)), half, 19.5, successors=("low1",)),
+        straight("low1", (-0.5 * math.cos(half), -0.5 * math.sin(half)), half, 0.5, successors=("on",)),
+        straight("high", (-20, 0), 0.0, 19.5, successors=("high1",)),
+        straight("high1", (-0.5, 0), 0.0, 0.5, successors=("on",)),
+        straight("on", (0, 0), 0.0, 0.5, successors=("out",)),
+        straight("out", (0.5, 0), 0.0, 60.0),
+    ]
+    net = network(lanes)
+    lane_map, rows = build_lane_map(net), lane_rows(net)
+    assert lane_map.lanes_behind == 4
+    step = jax.jit(lambda s: advance(Config(dt=0.1), lane_map, s, jnp.zeros(2))[0])
+    state = start_state(
+        lane_map, drivers(2), shapes(2), lane=jnp.array([rows["low"], rows["high"]]), s=jnp.array([18.0, 12.0]),
+        v=jnp.full(2, 4.0), goal=jnp.zeros(2, jnp.int32),
+    )  # fmt: skip
+    headings = []
+    for _ in range(9):
+        state = step(state)
+        headings.append(np.asarray(boxes(lane_map, state))[0, 2])
+    lane, _ = tails(lane_map, state)
+    assert lane[0].tolist() == [rows["on"], rows["low1"], rows["low"], -1]
+    assert state.lane[0] == rows["out"] and lane[1].tolist()[:1] == [-1]
+    assert headings[0] == pytest.approx(half, abs=1e-3), "the middle of the body is still on the slanted lane"
+    assert np.asarray(boxes(lane_map, state))[0, 2] == pytest.approx(half, abs=1e-3)

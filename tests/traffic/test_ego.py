@@ -14,6 +14,7 @@ from limsim_jax.policies.simple import FollowLane
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.trace import trace
 from limsim_jax.traffic import ego
+from limsim_jax.traffic.bodies import body_place
 from limsim_jax.traffic.ego import Control, Limits, Meta, Trajectory
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.traffic.motion import advance, boxes
@@ -33,7 +34,7 @@ def observe(lane_map, state: State) -> dict:
     """Both kinds of coordinates of all egos."""
     e = state.egos
     lane, s, d = state.lane[e.slot], state.s[e.slot], state.d[e.slot]
-    body, body_s = ego.body_place(lane_map, lane, state.previous[e.slot], s, state.shape.length[e.slot])
+    body, body_s = body_place(lane_map, state, e.slot)
     x, y, along = pose(lane_map, body, body_s, d)
     s_back, d_back, _ = to_frenet(lane_map, body, body_s, e.x, e.y)
     return {

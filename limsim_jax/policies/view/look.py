@@ -163,7 +163,8 @@ class View:
             lane = jnp.where(over, after, jnp.where(under, state.previous, state.lane))
             moved = jnp.where(sees, jnp.clip(moved, 0, lane_map.length[lane]), moved)
             previous = jnp.where(over, state.lane, jnp.where(under, NO_LANE, state.previous))
-            state = replace(state, lane=lane, previous=previous, s=moved, d=d)
+            earlier = jnp.where((over | under)[:, None], NO_LANE, state.earlier)
+            state = replace(state, lane=lane, previous=previous, earlier=earlier, s=moved, d=d)
         if self.speed_noise > 0:
             error = jax.random.normal(keys[1], mine.shape, state.v.dtype) * self.speed_noise
             state = replace(state, v=jnp.where(sees, jnp.maximum(state.v + error, 0), state.v))

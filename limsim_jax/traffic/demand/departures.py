@@ -12,8 +12,8 @@ from limsim_jax.maps.lane_map import (
     NO_LANE,
     LaneMap,
 )
+from limsim_jax.traffic.bodies import tails
 from limsim_jax.traffic.car_following import safe_speed
-from limsim_jax.traffic.motion import tails
 from limsim_jax.traffic.neighbors import follow_routes, look_ahead, other_lane
 from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config, Queues, Schedule, State

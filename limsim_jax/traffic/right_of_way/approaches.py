@@ -12,12 +12,9 @@ from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.neighbors import Ahead
 from limsim_jax.types import Config, State
 
-APPROACHES = 3
-"""Connectors ahead that a vehicle looks at: the one it is on, and those it comes to."""
-
 
 class Approaches(NamedTuple):
-    """The next connectors of every vehicle, `R` of them."""
+    """The next connectors of every vehicle, `R` of them: the one that it is on, and those it comes to."""
 
     connector: Int[Array, "N R"]  # -1 where there is none
     lane: Int[Array, "N R"]
@@ -42,7 +39,7 @@ def approaches_ahead(config: Config, lane_map: LaneMap, state: State, ahead: Ahe
     setback = (lane_map.length - lane_map.stop_s)[ahead.lane]
     found, line = [], jnp.full_like(state.s, -NO_GAP)
     inside = jnp.full_like(state.lane, -1)
-    for r in range(APPROACHES):
+    for r in range(lane_map.approaches):
         here = (connector >= 0) & (count == r + 1)
         index = jnp.argmax(here, -1)[:, None]
         exists = here.any(-1)

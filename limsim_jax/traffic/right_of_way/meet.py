@@ -14,11 +14,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
+from limsim_jax.traffic.bodies import tails
 from limsim_jax.traffic.car_following import NO_GAP
-from limsim_jax.traffic.motion import tails
 from limsim_jax.traffic.neighbors import SortKeys
 from limsim_jax.traffic.parameters import JUNCTIONS
-from limsim_jax.traffic.right_of_way.approaches import APPROACHES, Approaches
+from limsim_jax.traffic.right_of_way.approaches import Approaches
 from limsim_jax.traffic.right_of_way.passage import (
     Observed,
     Stretch,
@@ -150,8 +150,9 @@ def meet(
     waits, follows = computed_once((waits, follows))
     taken = (waits & ~follows).any(0)
     until = jnp.where(taken, distance_in[0], NO_GAP)
-    until = jnp.full(n * APPROACHES, NO_GAP, jnp.float32).at[pairs.row].min(until)
-    until = jnp.where(pairs.missed, jnp.minimum(until, 0), until).reshape(n, APPROACHES)
+    count = approaches.connector.shape[1]
+    until = jnp.full(n * count, NO_GAP, jnp.float32).at[pairs.row].min(until)
+    until = jnp.where(pairs.missed, jnp.minimum(until, 0), until).reshape(n, count)
 
     # in a split, the vehicle ahead on the other path, until its rear is clear
     in_front = there & splits & (other.front > jnp.maximum(level, 0))
@@ -165,10 +166,10 @@ def meet(
 def _sorted(lane_map: LaneMap, state: State, approaches: Approaches, observed: Observed) -> _OnConnectors:
     """Put vehicles in order on connectors."""
     table = lane_map.conflicts
-    # tails that are still on the connector behind, or on the one behind that if lanes are short
+    # tails that are still on connectors behind
     tail, front = tails(lane_map, state)
     tail = jnp.where(tail == NO_LANE, -1, table.connector[tail])
-    entries = jax.tree.map(lambda x: jnp.concatenate([x, x[:, :1], x[:, :1]], -1), observed)
+    entries = jax.tree.map(lambda x: jnp.concatenate([x, *[x[:, :1]] * tail.shape[1]], -1), observed)
     entries = entries._replace(
         front=jnp.concatenate([observed.front, front], -1),
         line=jnp.concatenate([observed.line, jnp.full_like(front, -NO_GAP)], -1),
@@ -213,7 +214,7 @@ def _pairs(
         c += (upto <= nth).astype(jnp.int32)
     exists = (pair < begin[-1] + number[-1]) & (c < slots)
     c = jnp.minimum(c, slots - 1)
-    vehicle, k, c = computed_once((row // APPROACHES, k.ravel()[row], c))
+    vehicle, k, c = computed_once((row // k.shape[1], k.ravel()[row], c))
     missed = (number > 0) & (begin + number > most)  # no room in the list: better wait
     return _Pairs(pair, row, vehicle, k, c, exists, missed)
 

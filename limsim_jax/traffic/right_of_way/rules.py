@@ -13,7 +13,7 @@ from limsim_jax.maps.signals import lane_states
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.neighbors import Pair
 from limsim_jax.traffic.parameters import JUNCTIONS
-from limsim_jax.traffic.right_of_way.approaches import APPROACHES, Approaches
+from limsim_jax.traffic.right_of_way.approaches import Approaches
 from limsim_jax.traffic.right_of_way.meet import meet
 from limsim_jax.traffic.right_of_way.passage import Observed
 from limsim_jax.traffic.right_of_way.stops import (
@@ -66,7 +66,9 @@ def give_way(
     sign, stopped = stop_signs(lane_map, state, approaches)
 
     def everywhere(x: Array) -> Array:
-        return jnp.broadcast_to(x[:, None] if x.ndim == 1 else x, (n, APPROACHES)).astype(jnp.float32)
+        return jnp.broadcast_to(x[:, None] if x.ndim == 1 else x, approaches.connector.shape).astype(
+            jnp.float32
+        )
 
     a = jnp.maximum(driver.a, 0.5)  # m/s^2: times stay finite
     observed = Observed(
@@ -88,7 +90,7 @@ def give_way(
     if table.foe.shape[1]:
         until, lead, lead_gap = meet(lane_map, state, approaches, observed)
     else:  # a map where paths never meet
-        until = jnp.full((n, APPROACHES), NO_GAP, jnp.float32)
+        until = jnp.full(approaches.connector.shape, NO_GAP, jnp.float32)
         lead, lead_gap = jnp.full(n, -1, jnp.int32), jnp.full(n, NO_GAP, jnp.float32)
     wait_s = table.wait_s[approaches.connector]
     stop, waits = stops_at_conflicts(wait_s, approaches, observed.brake, until, sign | full)

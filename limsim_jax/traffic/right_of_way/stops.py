@@ -10,7 +10,7 @@ from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.neighbors import Pair
 from limsim_jax.traffic.parameters import JUNCTIONS
-from limsim_jax.traffic.right_of_way.approaches import APPROACHES, Approaches
+from limsim_jax.traffic.right_of_way.approaches import Approaches
 from limsim_jax.types import State
 
 
@@ -88,7 +88,7 @@ def stop_signs(
     sign = lane_map.conflicts.must_stop[approaches.connector] & (approaches.line > -JUNCTIONS.margin)
     near = approaches.line[:, 0] < JUNCTIONS.sign_distance
     stopped = sign[:, 0] & (state.stopped | ((state.v < JUNCTIONS.sign_speed) & near))
-    return sign & ~(stopped[:, None] & (jnp.arange(APPROACHES) == 0)[None]), stopped
+    return sign & ~(stopped[:, None] & (jnp.arange(sign.shape[1]) == 0)[None]), stopped
 
 
 def stops_at_conflicts(
