@@ -3,9 +3,9 @@
     python experiments/random_maps.py [--maps 40] [--first 0] [--seeds 10] [--demand low moderate high]
     python experiments/random_maps.py --final
 
-Maps are those of `random_roads`, one per whole number. Those below 10,000 are for work. `--final` measures 300
-maps from 10,000 on, and nobody looks at single ones of these: otherwise they would become examples to learn
-from. Writes experiments/results/random_maps.json and .md, for work random_maps_work.json and .md. Rows are
+Maps are those of `random_roads`, one per whole number. Those below 10,000 are for work. `--final` measures
+300 maps from 10,000 on, and single ones of these are never looked at: they must not become examples. Writes
+experiments/results/random_maps.json and .md; runs for work write random_maps_work.json and .md. Rows are
 added as they are done, and a run that was broken off goes on where it was, unless the code has changed.
 """
 
@@ -49,7 +49,7 @@ WORST = 12
 
 
 class Programs:
-    """Programs that run worlds of one size class on any map of it."""
+    """Programs that run worlds on any map of a size class."""
 
     def __init__(self, slots: int, worlds: int, seconds: float) -> None:
         enable_compilation_cache()
@@ -152,7 +152,7 @@ def _one_line(error: Exception) -> str:
 
 
 def shares(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Shares of maps and of episodes without each fault, %, and the hardest braking."""
+    """Shares of maps and episodes without each fault, and further sums."""
     run = [row for row in rows if "episodes" in row]
     found: dict[str, Any] = {
         "maps": len({row["map"] for row in rows}),

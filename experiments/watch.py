@@ -62,7 +62,7 @@ class Changes:
 
 
 def mirror_of(table: ConflictTable) -> NDArray[np.int32]:
-    """Place in the flat table of the same crossing, as an entry of the foe, `[K, C]`."""
+    """Flat index of each crossing's entry in the row of its foe, `[K, C]`."""
     foe, cross = np.asarray(table.foe), np.asarray(table.type) == ConflictType.CROSS
     places = np.stack([np.asarray(x) for x in (table.s_in, table.s_out, table.f_in, table.f_out)], -1)
     mirror = np.zeros(foe.shape, np.int32)
@@ -137,7 +137,7 @@ EVENTS = (
 
 
 def summary(totals: Totals, counts: NDArray[Any]) -> dict[str, Any]:
-    """Totals `[B]` of worlds and the counts of `Watch` `[B, 5]`, added up."""
+    """Totals `[B]` and counts of `Watch` `[B, 5]` of worlds, added up."""
     together, against, must, *_ = (int(x) for x in counts.sum(0))
     events = {name: int(np.sum(getattr(totals, name))) for name in EVENTS}
     bad = np.nonzero(totals.collided | totals.gridlock | totals.off_road | totals.broken)[0]

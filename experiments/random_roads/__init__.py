@@ -17,7 +17,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "maps"))  # of `mapbuilder`
 
-from random_roads import motorways, streets, sumo_nets
+from random_roads import motorways, roundabouts, streets, sumo_nets
 from random_roads.junctions import Map, Unfit
 from random_roads.writer import footprint, write
 
@@ -33,6 +33,7 @@ DRAWN: dict[str, Callable[[np.random.Generator], Map]] = {
     "blocks": streets.blocks,
     "motorway": motorways.motorway,
     "road": motorways.plain_road,
+    "roundabout": roundabouts.roundabout,
 }
 """OpenDRIVE maps of our own."""
 
@@ -45,9 +46,9 @@ GENERATED: dict[str, Callable[[np.random.Generator, Path], None]] = {
 
 KINDS = (
     "crossing", "sumo grid", "chain", "motorway", "sumo random",
-    "blocks", "sumo spider", "road", "exported", "imported",
+    "blocks", "sumo spider", "road", "exported", "roundabout", "imported",
 )  # fmt: skip
-"""Kinds of maps by seed modulo 10; the last two are conversions."""
+"""Kinds of maps by seed modulo 11; `exported` and `imported` are conversions."""
 
 
 class RandomMap(NamedTuple):
@@ -108,7 +109,7 @@ def _draw(kind: str, rng: np.random.Generator, path: Path) -> None:
 
 
 def _refuse_overlaps(m: Map) -> None:
-    """`Unfit` if two roads outside junctions lie over one another, or one over itself."""
+    """`Unfit` if two roads overlap outside junctions, or one crosses itself."""
     from shapely import STRtree
     from shapely.geometry import LineString, Polygon
 

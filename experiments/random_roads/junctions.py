@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -103,6 +104,7 @@ class Map:
         road = Road(number, f"way {number}", line, strips, kind=kind, speed=speed, junction=junction)
         road.breaks = [s for s in breaks if 0.1 < s < line.length - 0.1]
         road.ends = {"start": source, "end": target}
+        road.height = Steps((0, source.road.height(source.s)))
         for i, (a, b) in enumerate(zip(lanes, onto, strict=True), 1):
             road.joined["start", -i] = a
             road.joined["end", -i] = b
@@ -111,7 +113,10 @@ class Map:
         return road
 
     def signal(self, contact: Contact, lanes: Sequence[int], back: float, **values: str) -> int:
-        """Add a light or sign for lanes that leave a road here, `back` metres before its end."""
+        """Add a light or sign for lanes that leave a road here.
+
+        It stands `back` metres before the end of the road.
+        """
         self.signals += 1
         road, at_end = contact.road, contact.at == "end"
         s = min(max(contact.s - back if at_end else back, 0.0), road.length)
@@ -188,7 +193,7 @@ def _closed(line: Curve, end: Pose) -> Curve:
 
 
 def _fits(least: float, largest: float, width: float) -> bool:
-    """Whether the centre line of a lane to the right of a bend is no sharper than `LEAST_RADIUS`."""
+    """Whether a lane to the right of a bend keeps `LEAST_RADIUS`."""
     right = -1 / least - width / 2 if least < 0 else math.inf
     left = 1 / largest + width / 2 if largest > 0 else math.inf
     return min(right, left) >= LEAST_RADIUS
@@ -200,7 +205,10 @@ def turn_between(source: Contact, target: Contact) -> float:
 
 
 def allot(turns: Sequence[float], lanes: int, rooms: Sequence[int], shared: Sequence[bool]) -> list[range]:
-    """Lanes for each turn, turns listed from the left and lanes from the middle, without crossings."""
+    """Lanes for each turn, such that no paths cross.
+
+    Turns are listed from the left, lanes from the middle.
+    """
     count = len(turns)
     if lanes < count:
         return [
@@ -213,7 +221,7 @@ def allot(turns: Sequence[float], lanes: int, rooms: Sequence[int], shared: Sequ
         free = [k for k in ahead if sizes[k] < rooms[k]]
         sizes[free[0] if free else ahead[0]] += 1
     first = np.cumsum([0, *sizes])
-    found = [range(int(a), int(b)) for a, b in zip(first, first[1:], strict=False)]
+    found = [range(int(a), int(b)) for a, b in itertools.pairwise(first)]
     for k, also in enumerate(shared):
         # a turn also takes the next lane of the way ahead
         if also and k != ahead[0] and rooms[k] > len(found[k]):
@@ -244,10 +252,8 @@ def crossing(m: Map, rng: np.random.Generator, arms: Sequence[Contact], style: S
             pairs = _pairs(rng, [lanes[k] for k in part], arms[j].entering(), turn, style)
             for a, b in _grouped(pairs, style.joint):
                 ways.append(Way(i, j, turn, _way(m, junction, source, a, arms[j], b, turn, style)))
-    entered = {(way.target, n) for way in ways for n in way.road.joined.values()}
     if any(arm.entering() and all(way.target != j for way in ways) for j, arm in enumerate(arms)):
         raise Unfit("an arm that no way leads to")
-    del entered
     return ways
 
 

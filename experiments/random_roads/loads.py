@@ -73,7 +73,7 @@ def _size(maps: tuple[int, ...], demand: tuple[int, ...], slots: int) -> Size:
 
 SIZES = {
     "small": _size(
-        (128, 4096, 4, 1024, 8192, 24576, 96, 16, 16, 16, 16, 32, 96, 4), (12, 12, 1024, 192, 256, 48), 96
+        (128, 8192, 4, 1024, 8192, 24576, 96, 16, 16, 16, 16, 32, 96, 6), (12, 12, 1024, 192, 256, 48), 96
     ),
     "medium": _size(
         (384, 8192, 6, 1024, 8192, 24576, 256, 24, 48, 24, 16, 32, 256, 8), (24, 24, 2048, 192, 512, 96), 160
@@ -130,7 +130,10 @@ def load(network: Network) -> Loaded:
 
 
 def demand_of(loaded: Loaded, level: str, seed: int, seconds: float) -> tuple[Demand, float]:
-    """Demand of a level for the map of a seed, and its rate in veh/h of all origins."""
+    """Demand of a level for the map of a seed.
+
+    Returns it and the rate of all origins together, veh/h.
+    """
     network, lane_map, _ = loaded
     names = list(origins(network)) or road_origins(network, ROADS_OF_A_CLOSED_MAP)
     lanes = origins(network)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from mapbuilder.curves import Curve, Piece, Pose, arc
 
-from random_roads.junctions import Map, Style, Unfit
+from random_roads.junctions import Junction, Map, Style, Unfit
 from random_roads.roads import Road, Steps, Strip
 from random_roads.streets import RoadPlan, bends
 
@@ -66,6 +66,9 @@ class _Motorway:
         self.at, self.before, self.extra = 0.0, None, 0.0  # m along; last road; length of an open outer lane
         self.smooth = bool(rng.random() < 0.5)
         self.joint = bool(rng.random() < 0.6)
+        typed = rng.random() < 0.3
+        self.entry, self.exit = ("entry", "exit") if typed else ("driving", "driving")
+        self.on_ramp, self.off_ramp = ("onRamp", "offRamp") if typed else ("driving", "driving")
 
     def event(self, event: str, space: float) -> None:
         """A stretch of road that ends with something."""
@@ -80,11 +83,11 @@ class _Motorway:
                 self.count += 1
             case "off":
                 road = self._road(space, {"pocket": min(taper, 0.3 * space)})
-                self._diverge(road, self.count, taken=True)
+                self._diverge(road, self.count)
             case "exit lane" if self.count > 1:
                 road = self._road(space, {})
                 self.count -= 1
-                self._diverge(road, self.count, taken=True)
+                self._diverge(road, self.count)
             case "gain" if self.count < 4:
                 self._merge(self._road(space, {}))
                 self.count += 1
@@ -93,7 +96,7 @@ class _Motorway:
                 self.count += 1
                 road = self._road(float(rng.uniform(120, 350)), {})
                 self.count -= 1
-                self._diverge(road, self.count, taken=True)
+                self._diverge(road, self.count)
             case _:
                 self._merge(self._road(space, {}))
                 self._road(space, {"merge": float(rng.uniform(60, 220)), "closing": taper})
@@ -123,6 +126,8 @@ class _Motorway:
             taper, long = changes["pocket"], 0.4 * length
             steps.append(Steps((length - long - taper, 0), (length - long, width), smooth=self.smooth))
         strips = [Strip(x) for x in steps] + [Strip(Steps((0, EDGE)), "shoulder")]
+        if "merge" in changes or "pocket" in changes:
+            strips[-2] = strips[-2]._replace(kind=self.entry if "merge" in changes else self.exit)
         road = self.m.road(f"main {len(self.m.roads) + 1}", line, strips, kind="motorway", speed=self.speed)
         if self.before is not None:
             self.m.link(self.before.end, road.start)
@@ -142,8 +147,8 @@ class _Motorway:
         mouth = self.base.pose(self.at).move(left=-main - EDGE - gap, turn=angle)
         away = mouth.move(turn=math.pi)
         ramp = Curve(away, self._ramp(-1)).reversed()
-        road = self._ramp_road("on-ramp", ramp)
-        before_at, line = self.at, self._nose()
+        road = self._ramp_road("on-ramp", ramp, self.on_ramp)
+        line = self._nose()
         after = self._peek()
         self._through(junction, before, after, line, self.count)
         style = Style("cubic", False, 1.0, False, self.smooth, (), 0, 0, 0)
@@ -161,7 +166,6 @@ class _Motorway:
         )
         if self.rng.random() < 0.5:
             junction.priorities.append((junction.roads[0], low))
-        del before_at
 
     def _peek(self) -> Road:
         """A short road behind a merge, with the lanes of both."""
@@ -172,10 +176,9 @@ class _Motorway:
         self.at, self.before = self.at + line.length, road
         return road
 
-    def _diverge(self, before: Road, keep: int, *, taken: bool) -> None:
+    def _diverge(self, before: Road, keep: int) -> None:
         """A junction at which the outermost lane becomes a ramp."""
         junction = self.m.junction()
-        start = self.at
         line = self._nose()
         strips = [*(Strip(Steps((0, self.width))) for _ in range(keep)), Strip(Steps((0, EDGE)), "shoulder")]
         main = self.base.cut(self.at, self.at + 30.0)
@@ -183,7 +186,7 @@ class _Motorway:
         self._through(junction, before, after, line, keep)
         gap, angle = float(self.rng.uniform(1.5, 4)), float(self.rng.uniform(0.04, 0.12))
         mouth = self.base.pose(self.at).move(left=-keep * self.width - EDGE - gap, turn=-angle)
-        road = self._ramp_road("off-ramp", Curve(mouth, self._ramp(-1)))
+        road = self._ramp_road("off-ramp", Curve(mouth, self._ramp(-1)), self.off_ramp)
         lane = before.end.leaving()[keep]
         style = Style("cubic", False, 1.0, False, self.smooth, (), 0, 0, 0)
         curve = style.line(before.end.inner_edge(lane), road.start.inner_edge(-1), self.width)
@@ -198,12 +201,8 @@ class _Motorway:
             kind="motorway",
         )
         self.at, self.before = self.at + main.length, after
-        del start, taken
 
-    def _through(self, junction: object, before: Road, after: Road, line: Curve, count: int) -> None:
-        from random_roads.junctions import Junction
-
-        assert isinstance(junction, Junction)
+    def _through(self, junction: Junction, before: Road, after: Road, line: Curve, count: int) -> None:
         sources, targets = before.end.leaving()[:count], after.start.entering()[:count]
         more = {"speed": self.speed, "kind": "motorway"}
         if self.joint:
@@ -225,14 +224,15 @@ class _Motorway:
             Piece(float(rng.uniform(30, 120))),
         ]
 
-    def _ramp_road(self, name: str, line: Curve) -> Road:
-        strips = [Strip(Steps((0, float(self.rng.uniform(3.25, 4.0))))), Strip(Steps((0, EDGE)), "shoulder")]
+    def _ramp_road(self, name: str, line: Curve, kind: str) -> Road:
+        width = Steps((0, float(self.rng.uniform(3.25, 4.0))))
+        strips = [Strip(width, kind), Strip(Steps((0, EDGE)), "shoulder")]
         speed = float(self.rng.choice([60, 80]))
         return self.m.road(f"{name} {len(self.m.roads) + 1}", line, strips, kind="motorway", speed=speed)
 
 
 def plain_road(rng: Rng) -> Map:
-    """Roads in a row, one or two ways, with lanes that open and end."""
+    """Roads in a row with lanes that open and end."""
     m = Map(left_hand=bool(rng.random() < 0.2))
     one_way = 1 if rng.random() < 0.3 else 0
     pose = Pose(0, 0, float(rng.uniform(-3, 3)))
@@ -258,13 +258,11 @@ def plain_road(rng: Rng) -> Map:
         verge = Steps((0, max(plan.verge[1], 0.5)))
         more = [[*x, Strip(verge, "shoulder")] if x else [] for x in (first, second)]
         road = m.road(f"road {k}", line, *more, kind="rural", speed=plan.speed, marks="broken")
-        end = road.end if not flip else road.start
         if before is not None:
             last = before.end if before.name.endswith("+") else before.start
             m.link(last, road.start if not flip else road.end)
         road.name += "+" if not flip else "-"
         before = road
-        del end
     return m
 
 

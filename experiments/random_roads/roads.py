@@ -18,9 +18,15 @@ if TYPE_CHECKING:
 
 Cubic = tuple[float, float, float, float]
 
+DRIVABLE = frozenset({"driving", "entry", "exit", "onRamp", "offRamp"})
+"""Types of lanes for motor traffic."""
+
 
 class Cubics:
-    """A reference line of parametric cubics: from pose to pose, `split` into equal shares of its parameter."""
+    """A reference line of parametric cubics from pose to pose.
+
+    It is `split` into equal shares of its parameter. `by_length`: records count the parameter in metres.
+    """
 
     def __init__(self, start: Pose, end: Pose, *, tension: float, split: int, by_length: bool) -> None:
         self.start, self.end, self.by_length = start, end, by_length
@@ -62,14 +68,18 @@ class Cubics:
         found = []
         for _, _, u, v in self.parts:
             p = np.linspace(0, 1, 33)
-            du, dv, ddu, ddv = (np.polynomial.Polynomial(c)(p) for c in (_slope(u), _slope(v), _slope(_slope(u)),
-                                                                       _slope(_slope(v))))  # fmt: skip
+            slopes = _slope(u), _slope(v)
+            du, dv = (np.polynomial.Polynomial(c)(p) for c in slopes)
+            ddu, ddv = (np.polynomial.Polynomial(_slope(c))(p) for c in slopes)
             found.append((du * ddv - dv * ddu) / np.maximum(np.hypot(du, dv), 1e-6) ** 3)
         return float(np.min(found)), float(np.max(found))
 
 
 def _restricted(c: np.ndarray, begin: float, share: float) -> np.ndarray:
-    """Coefficients of a cubic on a part of its parameter, which runs from 0 to 1 there."""
+    """Coefficients of a cubic on a part of its parameter.
+
+    The parameter runs from 0 to 1 there.
+    """
     part = np.polynomial.Polynomial(c)(np.polynomial.Polynomial([begin, share])).coef
     return np.pad(part, (0, 4 - len(part)))
 
@@ -160,6 +170,7 @@ class Road:
     kind: str = "town"
     speed: float = 50.0  # km/h
     offset: Steps = field(default_factory=lambda: Steps((0, 0)))
+    height: Steps = field(default_factory=lambda: Steps((0, 0)))
     breaks: Sequence[float] = ()  # further borders of lane sections
     marks: str = "broken"  # between lanes of a direction
     junction: Junction | None = None
@@ -222,12 +233,12 @@ class Contact(NamedTuple):
     def leaving(self) -> list[int]:
         """Lanes of traffic that leaves the road here, from the middle outwards."""
         sign = -1 if self.at == "end" else 1
-        return sorted((n for n, x in self.lanes().items() if n * sign > 0 and x.kind == "driving"), key=abs)
+        return sorted((n for n, x in self.lanes().items() if n * sign > 0 and x.kind in DRIVABLE), key=abs)
 
     def entering(self) -> list[int]:
-        """Lanes of traffic that comes into the road here, from the middle outwards."""
+        """Lanes of traffic that comes in here, from the middle outwards."""
         sign = 1 if self.at == "end" else -1
-        return sorted((n for n, x in self.lanes().items() if n * sign > 0 and x.kind == "driving"), key=abs)
+        return sorted((n for n, x in self.lanes().items() if n * sign > 0 and x.kind in DRIVABLE), key=abs)
 
     def width(self, number: int) -> float:
         """Of a lane, m."""

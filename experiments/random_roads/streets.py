@@ -51,7 +51,7 @@ def lane_plans(
 
     def some(role: str, low: float, high: float) -> None:
         plan = LanePlan(
-            role, float(rng.uniform(2.8, width)), float(rng.uniform(low, high)), float(rng.uniform(8, 45))
+            role, float(rng.uniform(2.8, width)), float(rng.uniform(low, high)), float(rng.uniform(12, 45))
         )
         (inner if rng.random() < 0.6 else outer).append(plan)
 
@@ -157,6 +157,7 @@ class Node:
 
     x: float
     y: float
+    z: float = 0.0
     arms: list[tuple[float, RoadPlan, int | None]] = field(default_factory=list)  # rad, road, node beyond
 
     def mouths(self, rng: Rng) -> list[Pose]:
@@ -181,7 +182,7 @@ class Node:
 
 
 def free_angles(rng: Rng, taken: Sequence[float], count: int) -> list[float]:
-    """Directions of further arms, each in the middle of the widest gap, about."""
+    """Directions of further arms, about in the middle of the widest gap."""
     angles = sorted(a % (2 * math.pi) for a in taken)
     found = []
     for _ in range(count):
@@ -217,15 +218,20 @@ def build(rng: Rng, nodes: list[Node], edges: Sequence[tuple[int, int]], arms: S
             one_way = 0 if way else int(rng.choice([-1, 1]))
             node.arms.append((angle, RoadPlan.draw(rng, start=True, end=False, one_way=one_way), None))
     mouths = [node.mouths(rng) for node in nodes]
+    steep = float(rng.uniform(0.5, 4)) if rng.random() < 0.3 else 0.0  # m
+    for node in nodes:
+        node.z = steep * float(rng.uniform(-1, 1))
     ends: list[list[Contact | None]] = [[None] * len(node.arms) for node in nodes]
     for a, node in enumerate(nodes):
         for i, (_, plan, b) in enumerate(node.arms):
             if b is None:
-                ends[a][i] = _arm(m, rng, plan, mouths[a][i])
+                ends[a][i] = outer_arm(
+                    m, rng, plan, mouths[a][i], (node.z, node.z + steep * float(rng.uniform(-1, 1)))
+                )
             elif a < b:
                 j = next(j for j, arm in enumerate(nodes[b].arms) if arm[1] is plan)
                 there = mouths[b][j].move(turn=math.pi)
-                if mouths[a][i].local(there)[0] < 12:
+                if mouths[a][i].local(there)[0] < 6:
                     raise Unfit("junctions too close")
                 line = join(mouths[a][i], there)
                 if line.length > 1.4 * math.hypot(node.x - nodes[b].x, node.y - nodes[b].y):
@@ -233,6 +239,7 @@ def build(rng: Rng, nodes: list[Node], edges: Sequence[tuple[int, int]], arms: S
                 if max(abs(k) for piece in line.pieces for k in piece[1:]) > 0.7 / plan.half_width():
                     raise Unfit("a road bent too sharply")
                 road = plan.build(m, f"{a} to {b}", line)
+                road.height = Steps((0, node.z), (line.length, nodes[b].z))
                 ends[a][i], ends[b][j] = road.start, road.end
     for found in ends:
         contacts = [x for x in found if x is not None]
@@ -241,10 +248,13 @@ def build(rng: Rng, nodes: list[Node], edges: Sequence[tuple[int, int]], arms: S
     return m
 
 
-def _arm(m: Map, rng: Rng, plan: RoadPlan, mouth: Pose) -> Contact:
-    """A road out of the map; perhaps two roads, of which the outer one may run inwards."""
+def outer_arm(
+    m: Map, rng: Rng, plan: RoadPlan, mouth: Pose, heights: tuple[float, float] = (0.0, 0.0)
+) -> Contact:
+    """A road out of the map, or two in a row."""
     line = Curve(mouth, bends(rng, float(rng.uniform(80, 200))))
     road = plan.build(m, f"arm {len(m.roads) + 1}", line)
+    road.height = Steps((0, heights[0]), (line.length, heights[1]))
     if rng.random() < 0.35:
         beyond = Curve(line.end, bends(rng, float(rng.uniform(40, 120))))
         right = [
@@ -265,6 +275,7 @@ def _arm(m: Map, rng: Rng, plan: RoadPlan, mouth: Pose) -> Contact:
                 f"beyond {road.name}", line, left, right, speed=plan.speed, offset=Steps((0, -shift))
             )
             m.link(road.end, more.end)
+        more.height = Steps((0, heights[1]))
     return road.start
 
 
@@ -276,7 +287,7 @@ def one_crossing(rng: Rng) -> Map:
 def chain(rng: Rng) -> Map:
     """Two or three junctions in a row."""
     count = int(rng.integers(2, 4))
-    space = float(rng.uniform(60, 180))
+    space = float(rng.uniform(45, 180))
     nodes = [Node(k * space, float(rng.uniform(-0.2, 0.2)) * space) for k in range(count)]
     ends = [k in (0, count - 1) for k in range(count)]
     return build(
@@ -290,8 +301,6 @@ def chain(rng: Rng) -> Map:
 def blocks(rng: Rng) -> Map:
     """Four junctions around a block, with arms outwards."""
     space = rng.uniform(90, 190, 2)
-    nodes = [
-        Node(*(float(v) for v in np.array([x, y]) * space + rng.uniform(-0.1, 0.1, 2) * space))
-        for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))
-    ]
+    corners = [np.array([x, y]) + rng.uniform(-0.1, 0.1, 2) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    nodes = [Node(float(x), float(y)) for x, y in (corner * space for corner in corners)]
     return build(rng, nodes, [(0, 1), (1, 2), (3, 2), (0, 3)], [int(x) for x in rng.integers(1, 3, 4)])

@@ -53,8 +53,12 @@ def _common(rng: Rng) -> list[str]:
         options.append("--random-priority")
     if rng.random() < 0.2:
         options.append("--lefthand")
-    if rng.random() < 0.7:
+    if rng.random() < 0.85:
         options += ["--no-turnarounds", "true"]
+    if rng.random() < 0.12:
+        options += ["--sidewalks.guess", "--crossings.guess"]
+    if rng.random() < 0.08:
+        options.append("--bikelanes.guess")
     if rng.random() < 0.3:
         options += ["--turn-lanes", "1", "--turn-lanes.length", f"{rng.uniform(15, 50):.0f}"]
     if rng.random() < 0.4:
@@ -113,7 +117,12 @@ def _block(rng: Rng) -> float:
 
 
 def as_opendrive(source: Path, path: Path) -> None:
-    """Write a SUMO network as OpenDRIVE."""
+    """Write a SUMO network as OpenDRIVE; `Unfit` for left-hand traffic.
+
+    For that netconvert writes no rule, and negative lane numbers on the left.
+    """
+    if ' lefthand="true"' in source.read_text():
+        raise Unfit("netconvert cannot export left-hand traffic")
     run("netconvert", "-s", str(source), "--opendrive-output", str(path))
 
 

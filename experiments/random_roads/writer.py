@@ -10,7 +10,7 @@ from lxml import etree
 from mapbuilder.curves import Pose, wrap
 
 from random_roads.junctions import Junction, Map
-from random_roads.roads import Contact, Cubics, Road
+from random_roads.roads import DRIVABLE, Contact, Cubics, Road
 
 
 def write(m: Map, path: Path) -> None:
@@ -56,6 +56,10 @@ def _road(road: Road) -> etree._Element:
     kind = etree.SubElement(element, "type", s="0", type=road.kind)
     etree.SubElement(kind, "speed", max=_text(road.speed), unit="km/h")
     _plan(road, etree.SubElement(element, "planView"))
+    if any(v for _, v in road.height.knots):
+        profile = etree.SubElement(element, "elevationProfile")
+        for s, cubic in road.height.records(0.0, road.length):
+            _cubic(profile, "elevation", "s", s, cubic)
     lanes = etree.SubElement(element, "lanes")
     if any(v for _, v in road.offset.knots):
         for s, cubic in road.offset.records(0.0, road.length):
@@ -130,11 +134,11 @@ def _lane(road: Road, index: int, number: int, begin: float, end: float) -> etre
     for s, cubic in strip.width.records(begin, end):
         _cubic(element, "width", "sOffset", s - begin, cubic)
     outer = road.numbers(index).get(number + (1 if number > 0 else -1))
-    inside = outer is not None and outer.kind == strip.kind == "driving"
+    inside = outer is not None and outer.kind in DRIVABLE and strip.kind in DRIVABLE
     mark = (road.marks if inside else "solid") if not road.junction or inside else "none"
     change = "both" if mark == "broken" else "none"
     etree.SubElement(element, "roadMark", sOffset="0", type=mark, laneChange=change)
-    if strip.kind == "driving":
+    if strip.kind in DRIVABLE:
         etree.SubElement(element, "speed", sOffset="0", max=_text(strip.speed or road.speed), unit="km/h")
     return element
 
@@ -153,9 +157,10 @@ def _beyond(road: Road, number: int, at: str, other: int) -> int | None:
     # where two starts or two ends meet, right lanes continue as left lanes
     to = number if neighbour.at != at else -number
     lanes, mine = neighbour.lanes(), Contact(road, at).lanes()
-    if to in lanes and lanes[to].kind == mine[number].kind:
-        return to
-    return None
+    if to not in lanes:
+        return None
+    kinds = {lanes[to].kind, mine[number].kind}
+    return to if len(kinds) == 1 or kinds <= DRIVABLE else None
 
 
 def _junction(junction: Junction) -> etree._Element:
