@@ -29,11 +29,12 @@ from watch import Watch, mirror_of, summary
 from limsim_jax.files import write_whole
 from limsim_jax.maps import MapError, read_network
 from limsim_jax.maps.cache import key as cache_key
+from limsim_jax.maps.lane_map import lane_ids
 from limsim_jax.simulation.rollout import Rollout, Started, started
 from limsim_jax.simulation.worlds import over_worlds
 from limsim_jax.traffic.demand import sample_scenario
 from limsim_jax.traffic.engine import Traffic
-from limsim_jax.types import Config
+from limsim_jax.types import Config, Status
 from limsim_jax.xla import enable_compilation_cache, run_once, use_all_cores
 
 RESULTS = Path(__file__).parent / "results"
@@ -43,6 +44,12 @@ SECONDS = 180.0
 
 OWN_SLOTS = 384
 """Vehicles at once on a map that fits into no size class."""
+
+SHOWN = "active", "lane", "s", "d", "v", "status", "struck", "struck_at", "waiting", "shape"
+"""What is kept of the vehicles at the end, to tell where faults happened."""
+
+PLACES = 6
+"""Places of faults per row, at most."""
 
 WORST = 12
 """Maps that the table lists."""
@@ -67,13 +74,13 @@ class Programs:
             lane_map, _, mirror = shared
             run = Rollout(config, traffic, seconds, measure=Watch(mirror))
             result, _ = run.advance(lane_map, *world)
-            return result.totals, result.measures
+            return result.totals, result.measures, {name: getattr(result.state, name) for name in SHOWN}
 
         self.start: Any = over_worlds(start, mesh, run_once())
         self.advance: Any = over_worlds(advance, mesh)
 
-    def run(self, shared: Any, worlds: int) -> tuple[Any, Any]:
-        """Totals and counts of the worlds 0, 1, ... on the host."""
+    def run(self, shared: Any, worlds: int) -> tuple[Any, Any, Any]:
+        """Totals, counts and last vehicles of the worlds 0, 1, ... on the host."""
         seeds = np.minimum(np.arange(self.chunk), worlds - 1).astype(np.int32)
         found = jax.device_get(self.advance(shared, self.start(shared, seeds)))
         return jax.tree.map(lambda x: x[:worlds], found)
@@ -86,7 +93,8 @@ class Programs:
 class Measurement:
     """Runs maps, with programs that maps of a size class share."""
 
-    def __init__(self, folder: Path, worlds: int, seconds: float) -> None:
+    def __init__(self, folder: Path, worlds: int, seconds: float, *, blind: bool) -> None:
+        self.blind = blind  # rows do not say where faults happened
         self.folder, self.worlds, self.seconds = folder, worlds, seconds
         self.programs: dict[str, Programs] = {}
 
@@ -126,7 +134,7 @@ class Measurement:
         programs = self.programs[loaded.size]
         shared = jax.tree.map(np.asarray, (loaded.lane_map, demand, mirror_of(loaded.lane_map.conflicts)))
         ready, before = time.perf_counter(), programs.compiled()
-        totals, counts = programs.run(shared, self.worlds)
+        totals, counts, vehicles = programs.run(shared, self.worlds)
         done = time.perf_counter()
         bad = {
             "contact": totals.collided > 0,
@@ -141,10 +149,36 @@ class Measurement:
             "episodes": self.worlds,
             **{f"{name}_worlds": np.nonzero(which)[0].tolist() for name, which in bad.items()},
             **{name: value for name, value in summary(totals, counts).items() if name != "suspects"},
+            **({} if self.blind else places(lane_ids(loaded.network), totals, vehicles)),
             "compiled": programs.compiled() - before,
             "prepare_s": round(ready - begin, 2),
             "run_s": round(done - ready, 2),
         }
+
+
+def places(ids: Sequence[str], totals: Any, vehicles: dict[str, Any]) -> dict[str, Any]:
+    """Where vehicles touched or left the road, and where the one stands that waited longest."""
+
+    def place(world: int, slot: int) -> str:
+        lane = int(vehicles["lane"][world, slot])
+        s, d = vehicles["s"][world, slot], vehicles["d"][world, slot]
+        long = vehicles["shape"].length[world, slot]
+        name = ids[lane] if 0 <= lane < len(ids) else "nowhere"
+        return f"{name} at {s:.1f} m, {d:.1f} m aside, {long:.1f} m long"
+
+    found: dict[str, list[str]] = {"contacts": [], "strays": [], "stands": []}
+    for world in range(len(totals.collided)):
+        status = np.where(vehicles["active"][world], vehicles["status"][world], 0)
+        for slot in np.nonzero(status & int(Status.COLLIDED))[0]:
+            when = f"world {world}, {vehicles['struck_at'][world, slot]:.1f} s: "
+            found["contacts"].append(when + place(world, slot))
+        for slot in np.nonzero(status & int(Status.OFF_ROAD))[0]:
+            found["strays"].append(f"world {world}: {place(world, slot)}")
+        if totals.gridlock[world]:
+            waits = np.where(vehicles["active"][world], vehicles["waiting"][world], -1)
+            slot = int(np.argmax(waits))
+            found["stands"].append(f"world {world}, for {waits[slot]:.0f} s: {place(world, slot)}")
+    return {name: some[:PLACES] for name, some in found.items() if some}
 
 
 def _one_line(error: Exception) -> str:
@@ -240,6 +274,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=SECONDS)
     parser.add_argument("--demand", nargs="+", default=["moderate"], choices=list(LEVELS))
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
+    parser.add_argument("--pick", nargs="+", type=int, help="these maps only")
     parser.add_argument("--final", action="store_true", help="the final measurement")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "limsim_random_maps")
     parser.add_argument("--out")
@@ -247,7 +282,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.final:
         options.first, options.maps = FINAL_FIRST, FINAL_MAPS
-    elif options.first + options.maps > FINAL_FIRST:
+    elif max(options.pick or [options.first + options.maps - 1]) >= FINAL_FIRST:
         parser.error(f"maps from {FINAL_FIRST} on are for --final")
     use_all_cores(options.cores)
     file = RESULTS / f"{options.out or ('random_maps' if options.final else 'random_maps_work')}.json"
@@ -259,8 +294,9 @@ def main() -> None:
     rows = (
         {(r["map"], r["demand"]): r for r in kept.get("rows", [])} if kept.get("setting") == setting else {}
     )
-    seeds = [s for s in range(options.first, options.first + options.maps) if kind_of(s) in options.kinds]
-    measurement = Measurement(options.folder, options.seeds, options.seconds)
+    wanted = options.pick or range(options.first, options.first + options.maps)
+    seeds = [seed for seed in wanted if kind_of(seed) in options.kinds]
+    measurement = Measurement(options.folder, options.seeds, options.seconds, blind=options.final)
     RESULTS.mkdir(exist_ok=True)
     for seed in seeds:
         todo = [level for level in options.demand if (seed, level) not in rows]
@@ -268,10 +304,10 @@ def main() -> None:
             rows[row["map"], row["demand"]] = row
             write_whole(file, json.dumps({"setting": setting, "rows": list(rows.values())}, indent=1) + "\n")
             print(_brief(row), flush=True)
-    wanted = [rows[seed, level] for seed in seeds for level in options.demand if (seed, level) in rows]
+    shown = [rows[seed, level] for seed in seeds for level in options.demand if (seed, level) in rows]
     head = "Regenerate: `python experiments/random_maps.py" + (" --final" if options.final else "") + "`\n\n"
     head += f"{options.seeds} worlds of {options.seconds:g} s per map and demand.\n\n"
-    text = head + report(wanted, final=options.final)
+    text = head + report(shown, final=options.final)
     write_whole(file.with_suffix(".md"), text)
     print(text)
 

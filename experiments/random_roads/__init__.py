@@ -84,6 +84,7 @@ def write_map(seed: int, folder: Path) -> RandomMap:
                     of = str(rng.choice(list(GENERATED)))
                     source = folder / f"{name}_source.net.xml"
                     GENERATED[of](rng, source)
+                    sumo_nets.refuse_overlaps(source)
                     sumo_nets.as_opendrive(source, path := folder / f"{name}.xodr")
                 case "imported":
                     of = str(rng.choice(list(DRAWN)))
@@ -93,6 +94,7 @@ def write_map(seed: int, folder: Path) -> RandomMap:
                 case _ if kind in GENERATED:
                     of = kind
                     GENERATED[kind](rng, path := folder / f"{name}.net.xml")
+                    sumo_nets.refuse_overlaps(path)
                 case _:
                     of = kind
                     _draw(kind, rng, path := folder / f"{name}.xodr")

@@ -7,10 +7,14 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+from lxml import etree
 
 from random_roads.junctions import Unfit
 
 Rng = np.random.Generator
+OVERLAP = 8.0
+"""m^2, by which two roads may overlap; where they meet at a sharp angle they do so a little."""
+
 PATIENCE = 60.0
 """s, for one run of a program."""
 
@@ -70,6 +74,28 @@ def _common(rng: Rng) -> list[str]:
     return [*options, "--seed", str(rng.integers(1, 10**6))]
 
 
+def refuse_overlaps(path: Path) -> None:
+    """`Unfit` if two roads of a network lie over one another.
+
+    netgenerate draws some of the roads that lead out of a spider over its spokes.
+    """
+    from shapely import STRtree, union_all
+    from shapely.geometry import LineString
+
+    edges = []
+    for edge in etree.parse(path).getroot().iterfind("edge"):
+        if edge.get("function"):
+            continue
+        bands = []
+        for lane in edge.iterfind("lane"):
+            points = [tuple(map(float, p.split(",")[:2])) for p in lane.get("shape", "").split()]
+            bands.append(LineString(points).buffer(float(lane.get("width", "3.2")) / 2, cap_style="flat"))
+        edges.append(union_all(bands))
+    for a, b in zip(*STRtree(edges).query(edges), strict=True):
+        if a < b and edges[a].intersection(edges[b]).area > OVERLAP:
+            raise Unfit("roads that overlap")
+
+
 def grid(rng: Rng, path: Path) -> None:
     """A grid of streets, often with streets that lead out."""
     options = [
@@ -82,7 +108,7 @@ def grid(rng: Rng, path: Path) -> None:
     options += ["--grid.x-length", f"{_block(rng):.0f}", "--grid.y-length", f"{_block(rng):.0f}"]
     options += ["--grid.attach-length", f"{rng.uniform(60, 180):.0f}"] if rng.random() < 0.85 else []
     if rng.random() < 0.4:
-        options += ["--perturb-x", "uniform(-12,12)", "--perturb-y", "uniform(-12,12)"]
+        options += ["--perturb-x", "normc(0,6,-12,12)", "--perturb-y", "normc(0,6,-12,12)"]
     run("netgenerate", *options, *_common(rng), "-o", str(path))
 
 
