@@ -157,7 +157,7 @@ class Measurement:
 
 
 def places(ids: Sequence[str], totals: Any, vehicles: dict[str, Any]) -> dict[str, Any]:
-    """Where vehicles touched or left the road, and where the one stands that waited longest."""
+    """Where vehicles touched, left the road, or stand for longest."""
 
     def place(world: int, slot: int) -> str:
         lane = int(vehicles["lane"][world, slot])
@@ -169,10 +169,10 @@ def places(ids: Sequence[str], totals: Any, vehicles: dict[str, Any]) -> dict[st
     found: dict[str, list[str]] = {"contacts": [], "strays": [], "stands": []}
     for world in range(len(totals.collided)):
         status = np.where(vehicles["active"][world], vehicles["status"][world], 0)
-        for slot in np.nonzero(status & int(Status.COLLIDED))[0]:
+        for slot in np.nonzero(status & int(Status.COLLIDED))[0].tolist():
             when = f"world {world}, {vehicles['struck_at'][world, slot]:.1f} s: "
             found["contacts"].append(when + place(world, slot))
-        for slot in np.nonzero(status & int(Status.OFF_ROAD))[0]:
+        for slot in np.nonzero(status & int(Status.OFF_ROAD))[0].tolist():
             found["strays"].append(f"world {world}: {place(world, slot)}")
         if totals.gridlock[world]:
             waits = np.where(vehicles["active"][world], vehicles["waiting"][world], -1)

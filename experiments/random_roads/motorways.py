@@ -63,7 +63,7 @@ class _Motorway:
     ) -> None:
         self.m, self.rng, self.base, self.width, self.speed = m, rng, base, width, speed
         self.nose, self.count = nose, count
-        self.at, self.before, self.extra = 0.0, None, 0.0  # m along; last road; length of an open outer lane
+        self.at, self.before = 0.0, None  # m along; the last road
         self.smooth = bool(rng.random() < 0.5)
         self.joint = bool(rng.random() < 0.6)
         typed = rng.random() < 0.3
