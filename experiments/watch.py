@@ -62,7 +62,7 @@ class Changes:
 
 
 def mirror_of(table: ConflictTable) -> NDArray[np.int32]:
-    """Flat index of each crossing in the row of its foe, `[K, C]`."""
+    """Flat index of each crossing in its foe's row, `[K, C]`."""
     foe, cross = np.asarray(table.foe), np.asarray(table.type) == ConflictType.CROSS
     places = np.stack([np.asarray(x) for x in (table.s_in, table.s_out, table.f_in, table.f_out)], -1)
     mirror = np.zeros(foe.shape, np.int32)
