@@ -20,7 +20,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from soundness import STANDS, Changes
+from watch import STANDS, Changes
 
 from limsim_jax.files import write_whole
 from limsim_jax.maps import build_lane_map, read_network

@@ -55,6 +55,7 @@ def build_lane_map(
     routes: Mapping[str, Sequence[str]] | None = None,
     *,
     report: ImportReport | None = None,
+    least: Mapping[str, int] | None = None,
     cache: bool = True,
 ) -> LaneMap:
     """Turn a network into device arrays: see `limsim_jax.maps.rasterise.build_lane_map`.
@@ -68,12 +69,12 @@ def build_lane_map(
 
     notes = ImportReport()
     identity = _loaded.get(network) if cache else None
-    name = _cache.key("lanes", *(identity or ()), _spell(goals), repr(routes or None))
+    name = _cache.key("lanes", *(identity or ()), _spell(goals), repr(routes or None), *_some(least))
     match _cache.load(name) if identity else None:
         case (rasterise.LaneMap() as arrays, ImportReport() as notes):
             built = jax.device_put(arrays)
         case _:
-            built = rasterise.build_lane_map(network, goals, routes, report=notes)
+            built = rasterise.build_lane_map(network, goals, routes, report=notes, least=least)
             if identity:
                 _cache.store(name, (jax.tree.map(np.asarray, built), notes))
     if report is not None:
@@ -88,6 +89,10 @@ def _spell(goals: Goals | None) -> str:
 
     groups = goals.values() if isinstance(goals, Mapping) else goals
     return repr(groups and [(isinstance(group, Round), *group) for group in groups])
+
+
+def _some(least: Mapping[str, int] | None) -> list[str]:
+    return [repr(sorted(least.items()))] if least else []
 
 
 def bundled_maps() -> dict[str, Path]:

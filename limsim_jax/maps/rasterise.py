@@ -68,7 +68,7 @@ _JUMP = 1.5e-3  # m: closer host samples are a kink or a step
 _JUMP_ZONE = 0.5  # m: around a kink or a step, heading and width are not judged
 _CURVATURE_SLIP = 1e-3  # rad: curvature and turn between two host samples that differ by more show a jump
 _MAX_ROWS = 2**24
-_LEAST = {  # least sizes of tables, so that all small maps have the same shapes
+LEAST = {
     "lanes": 64,
     "rows": 4096,
     "neighbors": 4,
@@ -83,7 +83,10 @@ _LEAST = {  # least sizes of tables, so that all small maps have the same shapes
     "links": 32,
     "movements": 64,
     "sight": 4,
+    "behind": 2,
+    "approaches": 3,
 }
+"""Least sizes of padded tables: all small maps have the same shapes, and share compiled programs."""
 
 
 def build_lane_map(
@@ -92,6 +95,7 @@ def build_lane_map(
     routes: Mapping[str, Sequence[str]] | None = None,
     *,
     report: ImportReport | None = None,
+    least: Mapping[str, int] | None = None,
 ) -> LaneMap:
     """Turn a network into arrays: lanes, conflicts, routes and signals.
 
@@ -101,11 +105,14 @@ def build_lane_map(
             ways out of the map, see `routing.default_goals`.
         routes: the roads to be driven, of goals by name whose way is prescribed.
         report: receives a note for every lane that misses `TOLERANCE` at the least interval length.
+        least: least sizes of tables by the names in `LEAST`, so that maps share compiled programs.
 
     Raises:
+        KeyError: an unknown name in `least`.
         MapError: no lane for motor traffic, numbers that are not finite, a link to a lane that is not
             there, or a lane that cannot be followed within `WORST_DEVIATION`.
     """
+    size = _sizes(least or {})
     goals = default_goals(network) if goals is None else goals  # those of the map as it is
     network = _without_side_steps(network, report)
     lanes = list(network.drivable_lanes())
@@ -113,7 +120,7 @@ def build_lane_map(
         raise MapError("no lane that motor traffic may use", file=network.source)
     host = _HostLanes.join(network, lanes)
     raster = _rasterise(network, host, report)
-    tables = _lane_tables(network, lanes)
+    tables = _lane_tables(network, lanes, size["neighbors"])
     origin = np.round((host.xyz[:, :2].min(0) + host.xyz[:, :2].max(0)) / 2)
     if np.abs(origin).max() >= 2**31:
         raise MapError("coordinates beyond 2^31 m", file=network.source)
@@ -121,8 +128,8 @@ def build_lane_map(
         raise MapError(f"{len(raster.lane)} intervals; at most {_MAX_ROWS} fit", file=network.source)
 
     num_rows, num_lanes = (
-        bucket(len(raster.lane) + 1, _LEAST["rows"]),
-        bucket(len(lanes) + 1, _LEAST["lanes"]),
+        bucket(len(raster.lane) + 1, size["rows"]),
+        bucket(len(lanes) + 1, size["lanes"]),
     )
     rows = raster.rows.copy()
     rows[:, [0, 4]] -= origin
@@ -152,17 +159,26 @@ def build_lane_map(
         "height": _pad(raster.height, num_rows, 0.0),
         "side": _pad(raster.side, num_rows, np.array([0.0, 1.0, 0.0, 1.0])),
         **{name: _pad(table, num_lanes, inert.get(name, _inert(table))) for name, table in tables.items()},
-        **_grid(raster, rows),
+        **_grid(raster, rows, size),
     }
-    sight = max(_lanes_in_sight(lanes, lane_rows(network)), _LEAST["sight"])
+    sight = max(_lanes_in_sight(lanes, lane_rows(network)), size["sight"])
+    rules = _rule_tables(network, goals, routes or {}, num_lanes, size, keep_foes="foes" in (least or {}))
     lane_map = LaneMap(
         **arrays,
-        **_rule_tables(network, goals, routes or {}, num_lanes),
+        **rules,
         lanes_in_sight=sight,
-        lanes_behind=_lanes_behind(lanes, lane_rows(network)),
-        approaches=_approaches(network),
+        lanes_behind=max(_lanes_behind(lanes, lane_rows(network)), min(size["behind"], EARLIER + 1)),
+        approaches=max(_approaches(network), size["approaches"]),
     )
     return jax.tree.map(lambda array: jnp.asarray(_device_type(array)), lane_map)
+
+
+def _sizes(least: Mapping[str, int]) -> dict[str, int]:
+    """Least sizes of all tables, larger where the caller wants that."""
+    unknown = sorted(set(least) - set(LEAST))
+    if unknown:
+        raise KeyError(f"no table '{unknown[0]}'; there are {', '.join(LEAST)}")
+    return {name: max(count, least.get(name, 0)) for name, count in LEAST.items()}
 
 
 def _without_side_steps(network: Network, report: ImportReport | None) -> Network:
@@ -213,9 +229,18 @@ def _way_round(lanes: Mapping[str, Lane], before: Lane, after: Lane) -> Lane | N
 
 
 def _rule_tables(
-    network: Network, goals: Goals, prescribed: Mapping[str, Sequence[str]], num_lanes: int
+    network: Network,
+    goals: Goals,
+    prescribed: Mapping[str, Sequence[str]],
+    num_lanes: int,
+    least: Mapping[str, int],
+    *,
+    keep_foes: bool,
 ) -> dict[str, Any]:
-    """Conflicts, routes and signals, padded to buckets."""
+    """Conflicts, routes and signals, padded to buckets.
+
+    `keep_foes`: a map without conflicts has room for some as well.
+    """
     rows = lane_rows(network)
     conflicts = build_conflicts(network, rows)
     routes = build_routes(network, rows, goals, prescribed=prescribed)
@@ -223,7 +248,7 @@ def _rule_tables(
     (connectors, foes), (_, num_goals) = conflicts.foe.shape, routes.distance.shape
     programs, phases, links = signals.state.shape
     size = {
-        name: bucket(count, _LEAST[name])
+        name: bucket(count, least[name])
         for name, count in {
             "connectors": connectors,
             "foes": foes,
@@ -234,7 +259,7 @@ def _rule_tables(
             "movements": len(signals.movement_link),
         }.items()
     }
-    if not foes:
+    if not foes and not keep_foes:
         size["foes"] = 0  # a program without conflicts is a third faster
     return {
         "conflicts": conflicts.pad(lanes=num_lanes, connectors=size["connectors"], foes=size["foes"]),
@@ -266,8 +291,8 @@ def _pad(table: NDArray[Any], size: int, value: Any) -> NDArray[Any]:
     return padded
 
 
-def _lane_tables(network: Network, lanes: list[Lane]) -> dict[str, NDArray[Any]]:
-    """Attributes and links of each lane, as arrays by row."""
+def _lane_tables(network: Network, lanes: list[Lane], neighbors: int) -> dict[str, NDArray[Any]]:
+    """Attributes and links of each lane, as arrays by row; room for `neighbors` links at least."""
     rows = {lane.id: row for row, lane in enumerate(lanes)}
     junctions = {junction: index for index, junction in enumerate(network.junctions)}
     stop_s = np.array([lane.length for lane in lanes])
@@ -291,7 +316,7 @@ def _lane_tables(network: Network, lanes: list[Lane]) -> dict[str, NDArray[Any]]
         found = [
             [r for other in getattr(lane, which) if (r := row_of(lane, other)) != NO_LANE] for lane in lanes
         ]
-        table = np.full((len(lanes), bucket(max(map(len, found)), _LEAST["neighbors"])), NO_LANE)
+        table = np.full((len(lanes), bucket(max(map(len, found)), neighbors)), NO_LANE)
         for row, others in enumerate(found):
             table[row, : len(others)] = others
         return table
@@ -689,7 +714,7 @@ def _curvature_max(host: _HostLanes) -> NDArray[np.float64]:
     return np.maximum.reduceat(largest, host.first)
 
 
-def _grid(raster: _Raster, rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+def _grid(raster: _Raster, rows: NDArray[np.float64], least: Mapping[str, int]) -> dict[str, NDArray[Any]]:
     """Tables of `project`: short stretches of lane, and those near each cell."""
     c, h = rows.T, rows[:, 14]
     turn = np.arctan2(polynomial(derivative(c[4:8]), h), polynomial(derivative(c[:4]), h)) - np.arctan2(
@@ -723,11 +748,11 @@ def _grid(raster: _Raster, rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]
         found.append(np.column_stack([cell[near].astype(np.int64), chunk[near]]))
     entries = np.unique(np.concatenate(found), axis=0)
     cells = np.unique(entries[:, :2], axis=0)
-    size = 1 << (max(2 * len(cells), _LEAST["cells"]) - 1).bit_length()
+    size = 1 << (max(2 * len(cells), least["cells"]) - 1).bit_length()
     keyed = np.unique(np.column_stack([cell_row(entries[:, 0], entries[:, 1], size), entries[:, 2]]), axis=0)
     return {
-        "chunk_lane": _pad(chunk_lane, bucket(len(chunk_lane), _LEAST["chunks"]), NO_LANE),
-        "chunk": _pad(chunks, bucket(len(chunks), _LEAST["chunks"]), 0.0),
+        "chunk_lane": _pad(chunk_lane, bucket(len(chunk_lane), least["chunks"]), NO_LANE),
+        "chunk": _pad(chunks, bucket(len(chunks), least["chunks"]), 0.0),
         "cell_start": np.searchsorted(keyed[:, 0], np.arange(size + 1)),
-        "cell_chunks": _pad(keyed[:, 1], bucket(len(keyed), _LEAST["candidates"]), 0),
+        "cell_chunks": _pad(keyed[:, 1], bucket(len(keyed), least["candidates"]), 0),
     }

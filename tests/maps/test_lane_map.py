@@ -583,6 +583,18 @@ def test_maps_in_the_same_buckets_share_one_program():
     assert not np.array_equal(one.rows, other.rows)
 
 
+def test_maps_of_different_size_share_shapes_on_request():
+    least = {"lanes": 128, "rows": 8192, "foes": 16, "goals": 24, "sight": 6}
+    some = [build_lane_map(network(Line((200.0, 0.0, 0.0)).lane("a")), least=least)]
+    some += [build_lane_map(network(*(Line((60.0, 0.0, 0.0), x=5.0 * k).lane(f"{k}") for k in range(100))))]
+    some += [build_lane_map(example(), least=least)]
+    one, plain, other = (jax.tree.map(np.shape, x) for x in some)
+    assert one == other != plain
+    assert len(some[0].length) == 128 and some[0].conflicts.foe.shape[1] == 16
+    with pytest.raises(KeyError, match="no table 'lane'"):
+        build_lane_map(example(), least={"lane": 1})
+
+
 @pytest.mark.engine
 def test_padding_does_not_matter(host, device, rows):
     """The same lanes in a map with many others, in larger buckets, give the same bits."""

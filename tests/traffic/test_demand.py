@@ -15,7 +15,7 @@ from synthetic import network as network_of
 from synthetic import straight
 from traffic_worlds import bundled, demand_of, drivers, overlap
 
-from limsim_jax.maps.lane_map import VEHICLE_CLASSES, lane_ids, lane_rows
+from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, lane_ids, lane_rows
 from limsim_jax.maps.origins import origins
 from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.maps.routing import default_goals
@@ -284,6 +284,33 @@ def test_vehicles_at_the_start(name, density):
         assert state.v[:n].mean() > 3.0
         places.add(tuple(np.round(s, 1)))
     assert len(places) == 4
+
+
+def test_demands_of_different_size_share_shapes_on_request():
+    """Vehicles at the start are as many as were asked for; their other slots are empty."""
+    network, lane_map = bundled("intersection")
+    least = {"streams": 16, "origins": 16, "rows": 1024, "arrivals": 192, "seats": 128, "vehicles": 24}
+    made = [
+        build_demand(
+            network,
+            lane_map,
+            default_goals(network),
+            [Flow(origin=list(origins(network))[:count], rate=100.0 * count)],
+            CARS,
+            horizon=60.0,
+            vehicles=3 * count,
+            least=least,
+        )
+        for count in (1, 4)
+    ]
+    assert len({str(jax.tree.map(np.shape, demand)) for demand in made}) == 1
+    for demand, vehicles in zip(made, (3, 12), strict=True):
+        state = worlds(demand, lane_map, keys(3), 32, start_part)
+        assert np.asarray(state.active).sum(1).tolist() == [vehicles] * 3
+        assert (np.asarray(state.lane)[~np.asarray(state.active)] == NO_LANE).all()
+        assert np.isfinite(np.asarray(state.v)).all()
+    with pytest.raises(KeyError, match="no table 'places'"):
+        build_demand(network, lane_map, default_goals(network), [], CARS, horizon=1.0, least={"places": 1})
 
 
 def test_places_at_the_start_keep_clear_of_other_lanes():

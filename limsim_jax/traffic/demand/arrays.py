@@ -14,6 +14,16 @@ LEAST_ROWS = 512
 LEAST_ORIGINS = 8
 """Lanes on which vehicles come in, at least."""
 
+LEAST = {
+    "streams": 4,
+    "origins": LEAST_ORIGINS,
+    "rows": LEAST_ROWS,
+    "arrivals": 8,  # of a stream
+    "seats": 0,
+    "vehicles": 0,  # at the start
+}
+"""Least sizes of tables of a demand."""
+
 NEVER = 1e9
 """s, time of unused rows of a schedule."""
 

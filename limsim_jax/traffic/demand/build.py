@@ -18,15 +18,14 @@ from limsim_jax.maps.lane_map import (
 )
 from limsim_jax.maps.network import Network
 from limsim_jax.traffic.demand.arrays import (
-    LEAST_ORIGINS,
-    LEAST_ROWS,
+    LEAST,
     NEVER,
     Demand,
     EgoStart,
     draw_number,
 )
 from limsim_jax.traffic.demand.flows import Flow, Stream, streams_of
-from limsim_jax.traffic.demand.seats import lay_out_seats
+from limsim_jax.traffic.demand.seats import lay_out_seats, with_room
 from limsim_jax.traffic.demand.tables import Tables, cumulative
 from limsim_jax.traffic.vehicles import Population
 
@@ -44,6 +43,7 @@ def build_demand(
     egos: EgoStart | None = None,
     placed: EgoStart | None = None,
     common: Collection[str] | None = None,
+    least: Mapping[str, int] | None = None,
 ) -> Demand:
     """Check flows and density, and lay them out for the device.
 
@@ -60,8 +60,11 @@ def build_demand(
       egos: vehicles under test; no other vehicle starts within `EGO_ROOM` on their lanes, or touches them.
       placed: other vehicles with a place of their own, for which the same holds.
       common: goals of flows without one, and of vehicles at the start; None: all.
+      least: least sizes of tables by the names in `LEAST`, so that demands share compiled programs. Those
+        of `seats` and `vehicles` change the draws of vehicles at the start.
 
     Raises:
+      KeyError: an unknown name in `least`.
       ValueError: an unknown or unreachable origin or goal, a number out of range, a lane that is open to
         none of the vehicles, or a density that does not fit; one line that says which.
     """
@@ -71,6 +74,10 @@ def build_demand(
         raise ValueError(f"density = {density:g} veh/km; it has to be 0 or more, and finite")
     if vehicles is not None and vehicles < 0:
         raise ValueError(f"vehicles = {vehicles}; it has to be 0 or more")
+    least = dict(least or {})
+    if unknown := sorted(set(least) - set(LEAST)):
+        raise KeyError(f"no table '{unknown[0]}'; there are {', '.join(LEAST)}")
+    size = {name: max(count, least.get(name, 0)) for name, count in LEAST.items()}
     tables = Tables.of(network, lane_map, goals, population, common)
     streams: list[Stream] = []
     for i, flow in enumerate(flows):
@@ -86,19 +93,20 @@ def build_demand(
         seats = lay_out_seats(tables, density, wanted, taken)
         if seats["initial"] not in (0, vehicles):  # lanes that are closed to all types have no places
             seats = lay_out_seats(tables, density * vehicles / seats["initial"], wanted, taken)
-    arrays = _lay_out(tables, streams) | seats
+    seats = with_room(seats, size["seats"], size["vehicles"])
+    arrays = _lay_out(tables, streams, size) | seats
     return jax.tree.map(jnp.asarray, Demand(population=population, **arrays))
 
 
-def _lay_out(tables: Tables, streams: list[Stream]) -> dict[str, Any]:
+def _lay_out(tables: Tables, streams: list[Stream], least: Mapping[str, int]) -> dict[str, Any]:
     """Streams and rows as arrays; origins in order of their lanes."""
     streams = sorted(streams, key=lambda stream: (stream.row, stream.number))
     lanes = sorted({stream.row for stream in streams})
     origin_of = np.array([lanes.index(stream.row) for stream in streams], int)
     capacity = np.array([stream.capacity() for stream in streams], int)
     rows = int(capacity.sum())
-    num_streams = bucket(len(streams), 4)
-    num_origins, num_rows = bucket(len(lanes), LEAST_ORIGINS), bucket(rows, LEAST_ROWS)
+    num_streams = bucket(len(streams), least["streams"])
+    num_origins, num_rows = bucket(len(lanes), least["origins"]), bucket(rows, least["rows"])
 
     def of_streams(values: list[Any], fill: Any, dtype: Any) -> NDArray[Any]:
         table = np.full((num_streams, *np.shape(fill)), fill, dtype)
@@ -133,5 +141,5 @@ def _lay_out(tables: Tables, streams: list[Stream]) -> dict[str, Any]:
         "row_arrival": of_rows(np.arange(rows) - np.repeat(first, capacity), 0),
         "start": start.astype(np.int32),
         "lane": lane.astype(np.int32),
-        "arrivals": bucket(int(capacity.max(initial=1)), 8),
+        "arrivals": bucket(int(capacity.max(initial=1)), least["arrivals"]),
     }

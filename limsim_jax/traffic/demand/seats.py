@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 
 from limsim_jax.geometry import box_separation
 from limsim_jax.maps.lane_map import (
+    NO_LANE,
     bucket,
 )
 from limsim_jax.maps.network import Lane
@@ -24,6 +25,7 @@ EGO_ROOM = 10.0
 """m before and behind an ego that are free on its lane at the start."""
 
 _CLEAR = 3.0  # m, least gap between vehicles at the start
+_CERTAIN = 1e6  # logarithm of a weight that decides whatever is drawn
 _MARGIN = 2.0  # m from the bodies of vehicles at the start to both ends of their lane
 
 
@@ -67,6 +69,28 @@ def lay_out_seats(
         "seat_types": cumulative(types).astype(np.float32),
         "initial": initial,
     }
+
+
+def with_room(seats: dict[str, Any], count: int, vehicles: int) -> dict[str, Any]:
+    """The same seats, padded.
+
+    Seats that are always taken, by nothing, fill up the `vehicles` at the start. Seats that are never taken
+    fill up the `count`.
+    """
+    empty = max(vehicles - seats["initial"], 0)
+    spare = max(bucket(len(seats["seat_lane"]) + empty, count) - len(seats["seat_lane"]) - empty, 0)
+    if not count and not vehicles:
+        return seats
+    fills = {"seat_lane": NO_LANE, "seat_s": 0.0, "seat_slack": 0.0, "seat_goals": 1.0, "seat_types": 1.0}
+    padded = {
+        name: np.concatenate(
+            [seats[name], np.full((empty + spare, *seats[name].shape[1:]), fill, seats[name].dtype)]
+        )
+        for name, fill in fills.items()
+    }
+    weight = np.repeat(np.array([_CERTAIN, -_CERTAIN], np.float32), [empty, spare])
+    padded["seat_weight"] = np.concatenate([seats["seat_weight"], weight])
+    return padded | {"initial": seats["initial"] + empty}
 
 
 def _places(
