@@ -25,15 +25,9 @@ from limsim_jax.maps import build_lane_map, bundled_maps, read_network
 from limsim_jax.simulation.rollout import Rollout
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweeps.build import plain_demand
-from limsim_jax.traffic.bodies import tails
 from limsim_jax.traffic.demand import sample_scenario
-<<<<<<< HEAD
-from limsim_jax.traffic.engine import Tick, Traffic
-from limsim_jax.types import Config, State, Status
-=======
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.types import Config
->>>>>>> 748cc196cef5ba1cc86b6b5aeaaff74c439acfa8
 from limsim_jax.xla import use_all_cores
 
 RESULTS = Path(__file__).parent / "results"

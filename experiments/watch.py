@@ -14,8 +14,8 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import lane_states
 from limsim_jax.simulation.totals import Totals
+from limsim_jax.traffic.bodies import tails
 from limsim_jax.traffic.engine import Tick
-from limsim_jax.traffic.motion import tails
 from limsim_jax.types import Config, State, Status
 
 RANK = np.zeros(len(SignalState), np.int32)  # by what a light shows; at red, vehicles inside clear first
