@@ -87,10 +87,12 @@ def enter(config: Config, lane_map: LaneMap, schedule: Schedule, state: State) -
     )
     fresh = replace(fresh, vehicle=mine, entered=jnp.full(n, now))
     world = {"step", "queues", "lights", "egos", "script"}
+
+    def chosen(new: Array, old: Array) -> Array:
+        return jnp.where(taken.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
     changed = {
-        x.name: jax.tree.map(
-            lambda new, old: jnp.where(taken, new, old), getattr(fresh, x.name), getattr(state, x.name)
-        )
+        x.name: jax.tree.map(chosen, getattr(fresh, x.name), getattr(state, x.name))
         for x in fields(State)
         if x.name not in world
     }
