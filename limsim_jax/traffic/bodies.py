@@ -50,9 +50,22 @@ def body_place(
     lane_map: LaneMap, state: State, slot: Int[Array, " E"] | None = None
 ) -> tuple[Int[Array, " E"], Float[Array, " E"]]:
     """Lane and arc length (m) of the centres of bodies, all or those in some slots."""
-    pick = (lambda x: x) if slot is None else (lambda x: x[slot])
-    lane, s = pick(state.lane), pick(state.s) - pick(state.shape.length) / 2
-    for behind in lanes_behind(lane_map, pick(state.previous), pick(state.earlier)).T:
+    half = state.shape.length / 2
+    if slot is None:
+        return place_behind(lane_map, state.lane, state.previous, state.earlier, state.s - half)
+    here = (x[slot] for x in (state.lane, state.previous, state.earlier, state.s - half))
+    return place_behind(lane_map, *here)
+
+
+def place_behind(
+    lane_map: LaneMap,
+    lane: Int[Array, " N"],
+    previous: Int[Array, " N"],
+    earlier: Int[Array, "N P"],
+    s: Float[Array, " N"],
+) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
+    """Lane and arc length (m) of places that may lie on the lanes behind, where `s` < 0."""
+    for behind in lanes_behind(lane_map, previous, earlier).T:
         back = (s < 0) & (behind != NO_LANE)
         lane, s = jnp.where(back, behind, lane), jnp.where(back, s + lane_map.length[behind], s)
     return lane, s

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from limsim_jax.geometry import polynomial
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, width
 from limsim_jax.numerics import safe_divide
-from limsim_jax.traffic.bodies import body_place
+from limsim_jax.traffic.bodies import place_behind
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing, ballistic
 from limsim_jax.traffic.ego import overlay_boxes
 from limsim_jax.traffic.neighbors import Obstacles
@@ -25,6 +25,7 @@ from limsim_jax.traffic.parameters import DRIVING, LANE_CHANGES
 from limsim_jax.types import Config, State, Status
 from limsim_jax.xla import column_min, computed_once
 
+_NO_WHEELBASE = 0.1  # m: a body with axles closer than that has one
 _STEEPEST = math.tan(LANE_CHANGES.steepest)
 _GOAL = -2  # in place of the next lane, at the end of a goal
 _HAND_OVERS = 3  # lanes that a vehicle may leave behind in one step
@@ -224,12 +225,23 @@ def lateral_speed(state: State) -> Float[Array, " N"]:
 def boxes(lane_map: LaneMap, state: State) -> Float[Array, "N 5"]:
     """Oriented boxes: x, y (m) of the centre, heading (rad), length, width (m).
 
-    The body lies on the lane at its centre, half a length behind the front bumper, which may be on a
-    lane behind; it is turned by the direction of its motion. Free egos are where they are in the plane.
+    A body is rigid, and both axles are on the path of the vehicle, which may run over lanes behind. It is
+    turned by the direction of a lane change. Free egos are where they are in the plane.
     """
     shape = state.shape
-    lane, s = body_place(lane_map, state)
-    x, y, heading = pose(lane_map, lane, s, state.d)
+    trail = state.lane, state.previous, state.earlier
+    half = shape.length / 2
+    axles = [
+        place_behind(lane_map, *trail, state.s - half + x)
+        for x in (shape.wheelbase / 2, -shape.wheelbase / 2)
+    ]
+    lane, s = (jnp.stack(column, -1) for column in zip(*axles, strict=True))
+    x, y, along = pose(lane_map, lane, s, state.d[:, None])
+    dx, dy = x[:, 0] - x[:, 1], y[:, 0] - y[:, 1]
+    # axles of a vehicle without a wheelbase are in one place
+    apart = shape.wheelbase > _NO_WHEELBASE
+    heading = jnp.where(apart, jnp.arctan2(dy, jnp.where(apart, dx, 1.0)), along[:, 0])
+    x, y = x.mean(-1), y.mean(-1)
     slope = jnp.clip(lateral_speed(state) / jnp.maximum(state.v, 0.5), -_STEEPEST, _STEEPEST)
     turned = slope * polynomial((1, -1 / 3, 1 / 5, -1 / 7), slope * slope)  # the arc tangent, to 1e-7
     x, y, heading = computed_once((x, y, heading + turned))

@@ -106,12 +106,20 @@ def test_separate_stretches_are_separate_entries():
     assert [(m["f_in"], m["f_out"]) for m in mirror] == [(e["s_in"], e["s_out"]) for e in (first, second)]
 
 
+def is_sharp(lane):
+    """Whether a body on it swings round on the spot: more than 1.5 rad within 5 m."""
+    s = np.linspace(0, lane.length, 400)
+    heading = np.unwrap(lane.pose(s)[1])
+    return np.abs(np.interp(s + 5.0, s, heading) - heading).max() > 1.5
+
+
 def brute_force(lane, foe, step=0.02):
     """First and last point of a lane that is within reach of the other, by dense sampling."""
+    reach = REACH + (1.8 if is_sharp(lane) or is_sharp(foe) else 0.0)
     s = np.linspace(0, lane.length, math.ceil(lane.length / step) + 1)
     t = np.linspace(0, foe.length, math.ceil(foe.length / step) + 1)
     distance, _ = KDTree(foe.pose(t)[0][:, :2]).query(lane.pose(s)[0][:, :2])
-    near = s[distance < REACH]
+    near = s[distance < reach]
     return (near.min(), near.max()) if len(near) else None
 
 
@@ -634,7 +642,8 @@ def test_conflicts_are_the_foes_of_sumo(path):
         a, b = net.movements[one], net.movements[two]
         assert net.lanes[a.outgoing].road == net.lanes[b.outgoing].road
         assert a.outgoing != b.outgoing
-    grazing = ours.keys() - theirs
+    swings = {m.index for m in known if any(is_sharp(net.lanes[x]) for x in m.via)}  # SUMO has no bodies
+    grazing = {pair for pair in ours.keys() - theirs if not swings & set(pair)}
     assert len(grazing) <= 0.01 * len(theirs)
     assert all(e["s_out"] - e["s_in"] < 3.0 for pair in grazing for e in ours[pair])
     for one, two in theirs & ours.keys():

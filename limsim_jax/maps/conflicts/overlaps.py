@@ -30,6 +30,10 @@ CLEARANCE = 3.5
 LONGEST = 12.0
 """Length (m) of the longest body that sweeps."""
 
+SHARPEST = 1.5
+"""Turn (rad) within `_BEND` above which a body swings round on the spot: a radius below 3.3 m."""
+
+_SWING = 1.8  # m, by which the corners of a car stand out more when it turns on the spot than along its way
 _STEP = 0.25  # m, sampling of the centre lines
 _REACH = 200.0  # m, from a merge or split outside junctions, on which two lanes are compared
 _STEP_ASIDE = 8.0  # m at the end of a lane that jumps aside to another one
@@ -97,9 +101,10 @@ def find_overlaps(lanes: Sequence[Lane], width: float, margin: float) -> list[Ov
     """
     curves, reach = _Curves(lanes), width + margin
     regions = []
-    for a, b in _candidates(lanes, curves, reach):
-        regions.extend(curves.regions(a, b, reach))
-    stretches = curves.refine(regions, reach)
+    sharp = [curves.sharpest(a) > SHARPEST for a in range(len(curves.owner))]
+    for a, b in _candidates(lanes, curves, reach + _SWING if any(sharp) else reach):
+        regions.extend(curves.regions(a, b, reach + _SWING if sharp[a] or sharp[b] else reach))
+    stretches = curves.refine(regions)
     overlaps = [
         Overlap(
             first=curves.owner[region.a],
@@ -212,6 +217,7 @@ class _Region:
     p1: int
     q0: int
     q1: int
+    reach: float  # m
 
 
 class _Curves:
@@ -252,8 +258,8 @@ class _Curves:
 
         Times l^2 it is how far the ends of a body of length l stand out.
         """
-        s, xy = self.s[a], self.xyz[a][:, :2]
-        heading = np.unwrap(np.arctan2(*np.gradient(xy, axis=0).T[::-1]))
+        s = self.s[a]
+        heading = self.heading(a)
         bend = np.interp(s + _BEND / 2, s, heading) - np.interp(s - _BEND / 2, s, heading)
         return (bend / _BEND / 8)[:, None] * np.stack([np.sin(heading), -np.cos(heading)], -1)
 
@@ -264,12 +270,12 @@ class _Curves:
         if not len(p):
             return []
         if p[-1] - p[0] + 1 == len(p) and q[-1] - q[0] + 1 == len(q):
-            return [_Region(a, b, *map(int, (p[0], p[-1], q[0], q[-1])))]
+            return [_Region(a, b, *map(int, (p[0], p[-1], q[0], q[-1])), reach)]
         parts, count = cast("tuple[NDArray[np.int32], int]", label(near, structure=np.ones((3, 3))))
         found = []
         for part in range(1, count + 1):
             p, q = np.nonzero(parts == part)
-            found.append(_Region(a, b, *map(int, (p.min(), p.max(), q.min(), q.max()))))
+            found.append(_Region(a, b, *map(int, (p.min(), p.max(), q.min(), q.max())), reach))
         return found
 
     def distance(self, a: int, b: int) -> Floats:
@@ -284,7 +290,17 @@ class _Curves:
             distance[over] = np.inf
         return distance
 
-    def refine(self, regions: Sequence[_Region], reach: float) -> Float[np.ndarray, "R 4"]:
+    def sharpest(self, a: int) -> float:
+        """Largest turn (rad) within `_BEND`, also from and to where the curve ends."""
+        heading = self.heading(a)
+        s = self.s[a]
+        return float(np.abs(np.interp(s + _BEND, s, heading) - heading).max())
+
+    def heading(self, a: int) -> Floats:
+        """Direction of the curve at its samples, rad."""
+        return np.unwrap(np.arctan2(*np.gradient(self.xyz[a][:, :2], axis=0).T[::-1]))
+
+    def refine(self, regions: Sequence[_Region]) -> Float[np.ndarray, "R 4"]:
         """s_in, s_out, f_in, f_out (m) of every region, interpolated between samples.
 
         The distance of a sample from the other curve is that from the chords next to its nearest
@@ -302,6 +318,7 @@ class _Curves:
         ]
         if not edges:
             return np.empty((0, 4))
+        reach = np.repeat([r.reach for r in regions], 4)
         start = np.cumsum([0, *map(len, self.s)])
         s, xyz = np.concatenate(self.s), np.concatenate(self.xyz)
         curve, inside, step, other, lo, hi = np.array(edges).T
