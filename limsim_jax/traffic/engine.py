@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, room_beside
 from limsim_jax.maps.routing import NO_ROOM
@@ -184,23 +184,32 @@ def decide(
 def _give_up(lane_map: LaneMap, state: State) -> State:
     """Give vehicles stuck at the end of a wrong lane another goal.
 
-    That is the nearest one that the lane does lead to, without another lane change if possible. It is
-    recorded as `Status.MISSED_ROUTE`. On fast roads drivers give up sooner.
+    That is the nearest one that the lane does lead to, without another lane change if possible. From a lane
+    that ends it is the nearest one on the other side. It is recorded as `Status.MISSED_ROUTE`. On fast roads
+    drivers give up sooner.
     """
     routes = lane_map.routes
     leads_on = (routes.next_lane != NO_LANE) | routes.is_goal  # [L, G], the same for all worlds
-    nearest = jnp.argmin(jnp.where(leads_on, routes.distance, jnp.inf), -1).astype(state.goal.dtype)
+
+    def nearest_of(which: Bool[Array, "L G"]) -> tuple[Int[Array, " L"], Bool[Array, " L"]]:
+        nearest = jnp.argmin(jnp.where(which, routes.distance, jnp.inf), -1).astype(state.goal.dtype)
+        return nearest, which.any(-1)
+
+    ahead, ends_well = nearest_of(leads_on)
+    left, right = (nearest_of(routes.reachable & (jnp.sign(routes.lanes_to_go) == side)) for side in (1, -1))
     fast = lane_map.speed_limit[state.lane] > DRIVING.fast_limit
     patience = jnp.where(fast, DRIVING.fast_patience * DRIVING.patience, DRIVING.patience)
     # a vehicle waits on the lane, or before it if the lane is too short to wait on
     after = routes.next_lane[state.lane, state.goal]
     before = (after != NO_LANE) & (lane_map.length[after] < NO_ROOM)
     lane = jnp.where(before, after, state.lane)
-    to_end = lane_map.length[state.lane] - state.s
+    to_end = lane_map.end_s[state.lane] - state.s
     near = to_end < jnp.where(before, NO_ROOM, DRIVING.end_room)
     stuck = state.active & ~leads_on[lane, state.goal] & (state.waiting > patience) & near
-    goal = nearest[lane]
-    changes = stuck & leads_on.any(-1)[lane]
+    to_left = routes.lanes_to_go[lane, state.goal] < 0  # it wants to the right
+    other, there = (jnp.where(to_left, x[lane], y[lane]) for x, y in zip(left, right, strict=True))
+    goal = jnp.where(ends_well[lane], ahead[lane], other)
+    changes = stuck & (ends_well[lane] | there)
     return replace(
         state,
         goal=jnp.where(changes, goal, state.goal),
@@ -249,10 +258,14 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
     end = ahead.start + lane_map.length[ahead.lane] - DRIVING.end_gap
     wide = ahead.start + lane_map.end_s[ahead.lane] - DRIVING.end_gap
     # at most half of a short lane: no vehicle waits before it, on a lane that it would block
-    clear = DRIVING.end_clear - DRIVING.end_gap
+    creep = LANE_CHANGES.creep_speed * state.driver.lane_change_time + state.driver.s0
+    clear = (jnp.maximum(DRIVING.end_clear, creep) - DRIVING.end_gap)[:, None]
     room = jnp.maximum(wide - clear, ahead.start + lane_map.length[ahead.lane] / 2)
     end = jnp.where((state.side == 0)[:, None], jnp.where(room > stopping, room, wide), end)
-    return jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
+    end = jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
+    # it matters from where a driver begins to brake for it
+    begins = state.v * (state.v / (2 * DRIVING.end_comfort) + DRIVING.end_sight) + state.driver.s0
+    return jnp.where(end > begins, NO_GAP, end)
 
 
 @jax.named_scope("speeds")

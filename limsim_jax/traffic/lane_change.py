@@ -226,7 +226,9 @@ def choose_lane(
     away = (wanted * side < 0) | ((wanted == side) & farther) | ((wanted == 0) & (back_to_go != 0))
     count = jnp.abs(back_to_go).astype(back.dtype)
     speed = jnp.maximum(state.v, LANE_CHANGES.jam_speed)
-    late = away & (back < LANE_CHANGES.return_factor * speed * driver.lane_change_time * (count + 1))
+    late = back < LANE_CHANGES.return_factor * speed * driver.lane_change_time * (count + 1)
+    late |= back < LANE_CHANGES.detour_time * lane_map.speed_limit[state.lane]
+    late &= away
     rested = (state.rest <= 0) | (press > 0)
     starts = allowed & reachable & safe & ~late & rested & (advantage > driver.threshold) & (side == turn)
 
@@ -240,7 +242,10 @@ def choose_lane(
     minds = (asks | (starts & towards)) & follower
     letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(minds, pair.lag, n)].max(me)[:n]
     letting_gap = pair.lag_gap[letting]
-    lets = (letting >= 0) & (letting_gap > 0)
+    # above walking speed also a driver beside it, who falls back
+    beside = (letting_gap > -shape.length) & (state.v > LANE_CHANGES.yielding_speed)
+    lets = (letting >= 0) & ((letting_gap > 0) | beside)
+    letting_gap = jnp.maximum(letting_gap, room)
     courtesy = Obstacles(
         jnp.stack([jnp.where(lets, letting, -1), jnp.where(asks, pair.lead, -1)], -1),
         jnp.stack([jnp.where(lets, letting_gap, NO_GAP), jnp.where(asks, pair.lead_gap, NO_GAP)], -1),

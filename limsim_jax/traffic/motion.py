@@ -157,6 +157,22 @@ def smooth_step(u: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return u * u * u * (10 + u * (-15 + 6 * u))
 
 
+def _stalled(lane_map: LaneMap, state: State) -> State:
+    """Give up lane changes that stand at their start, unless the route asks for them.
+
+    They block two lanes.
+    """
+    asked = jnp.sign(lane_map.routes.lanes_to_go[state.lane, state.goal]) == state.side
+    stalls = ~asked & (state.side != 0) & ~state.crossed & state.active
+    stalls &= (jnp.abs(state.d) < LANE_CHANGES.stall_offset) & (state.waiting > LANE_CHANGES.stall_time)
+    return replace(
+        state,
+        side=jnp.where(stalls, 0, state.side),
+        progress=jnp.where(stalls, 0, state.progress),
+        shift=jnp.where(stalls, 0, state.shift),
+    )
+
+
 def _turn_back(lane_map: LaneMap, state: State) -> State:
     """Return to the own lane if the other lane ends."""
     beside = jnp.where(state.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
@@ -173,7 +189,7 @@ def _turn_back(lane_map: LaneMap, state: State) -> State:
 @jax.named_scope("lane_change_motion")
 def _move_sideways(config: Config, lane_map: LaneMap, state: State) -> State:
     """Continue lane changes: d follows a quintic; half-way the lane becomes the other one."""
-    state = _turn_back(lane_map, state)
+    state = _turn_back(lane_map, _stalled(lane_map, state))
     changing = state.active & (state.side != 0)
     rate = jnp.minimum(state.v / LANE_CHANGES.creep_speed, 1)
     done = state.progress + rate * safe_divide(jnp.full_like(rate, config.dt), state.driver.lane_change_time)

@@ -316,6 +316,26 @@ class LaneChanging:
     jam_speed: float = _number(
         4.0, "m/s", "least speed that is assumed for that", "chosen: a jam may dissolve", (1.0, 10.0)
     )
+    detour_time: float = _number(
+        9.0,
+        "s",
+        "at the speed limit, before the last place to change back, without changes away from the route",
+        "chosen: 300 m on a motorway, the first of two signs before a lane ends",
+        (0.0, 30.0),
+    )
+    stall_time: float = _number(
+        3.0, "s", "standing at the start of a lane change, after which it is given up", "chosen", (1.0, 30.0)
+    )
+    stall_offset: float = _number(
+        0.3, "m", "from the middle of the lane, up to which that is possible", "chosen", (0.0, 1.0)
+    )
+    yielding_speed: float = _number(
+        3.0,
+        "m/s",
+        "speed above which a driver also lets in a vehicle that is still beside",
+        "chosen: in a queue nobody has to fall back",
+        (0.0, 10.0),
+    )
     hardest: float = _number(
         0.5,
         "1",
@@ -420,6 +440,16 @@ class Driving:
         "kept free before that end, to start a lane change from a standstill",
         "chosen: the way of a lane change at `creep_speed`",
         (5.0, 100.0),
+    )
+    end_comfort: float = _number(
+        2.0,
+        "m/s^2",
+        "braking to a stop at the end of a lane; while less is enough, a driver does not slow down for it",
+        "chosen: comfortable, so that vehicles accelerate on acceleration lanes",
+        (1.0, 4.0),
+    )
+    end_sight: float = _number(
+        1.0, "s", "before that, at which the end begins to count", "chosen: two decisions", (0.0, 3.0)
     )
     end_braking: float = _number(
         3.0,
