@@ -26,6 +26,7 @@ from random_roads import KINDS, Unfit, kind_of, write_map
 from random_roads.loads import LEVELS, SIZES, Loaded, demand_of, load
 from watch import Watch, mirror_of, summary
 
+import limsim_jax
 from limsim_jax.files import write_whole
 from limsim_jax.maps import MapError, read_network
 from limsim_jax.maps.cache import key as cache_key
@@ -286,9 +287,9 @@ def main() -> None:
         parser.error(f"maps from {FINAL_FIRST} on are for --final")
     use_all_cores(options.cores)
     file = RESULTS / f"{options.out or ('random_maps' if options.final else 'random_maps_work')}.json"
-    code = cache_key(
-        "random maps", *(path.read_text() for path in sorted(Path(__file__).parent.glob("random_roads/*.py")))
-    )
+    here, package = Path(__file__).parent, Path(limsim_jax.__file__).parent
+    sources = sorted([*here.glob("random_roads/*.py"), here / "watch.py", *package.glob("**/*.py")])
+    code = cache_key("random maps", *(path.read_text() for path in sources))
     setting = {"code": code[-12:], "episodes": options.seeds, "seconds": options.seconds}
     kept = json.loads(file.read_text()) if file.exists() else {}
     rows = (

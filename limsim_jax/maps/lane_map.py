@@ -81,8 +81,8 @@ class LaneMap:
     length: Float[Array, " L"]  # m
     speed_limit: Float[Array, " L"]  # m/s
     stop_s: Float[Array, " L"]  # m, where the front bumper stops: last stop line or end of the lane
-    start_s: Float[Array, " L"]  # m, where a lane without predecessors becomes wide enough; otherwise 0
-    end_s: Float[Array, " L"]  # m, where a lane without successors becomes too narrow; otherwise its length
+    start_s: Float[Array, " L"]  # m, where an opening lane becomes wide enough; otherwise 0
+    end_s: Float[Array, " L"]  # m, where a closing lane becomes too narrow; otherwise its length
     curvature_max: Float[Array, " L"]  # 1/m, largest |mean curvature| over any `rasterise.TURN_WINDOW`
     left: Int[Array, " L"]  # neighbour in the same direction
     right: Int[Array, " L"]

@@ -36,7 +36,7 @@ from limsim_jax.maps.lane_map import (
 from limsim_jax.maps.network import ImportReport, Lane, MapError, Network
 from limsim_jax.maps.routing import build_routes, default_goals
 from limsim_jax.maps.signals import build_signals
-from limsim_jax.maps.widths import begins_narrow, ends_narrow, wide_from, wide_until
+from limsim_jax.maps.widths import begins_narrow, ends_narrow, usable
 
 Floats = NDArray[np.float64]
 
@@ -321,19 +321,20 @@ def _lane_tables(network: Network, lanes: list[Lane], neighbors: int) -> dict[st
             table[row, : len(others)] = others
         return table
 
+    wide = usable(network)
     left = np.array([row_of(lane, lane.left) for lane in lanes])
     right = np.array([row_of(lane, lane.right) for lane in lanes])
     return {
         "speed_limit": np.array([lane.speed_limit for lane in lanes], float),
         "stop_s": stop_s,
-        "start_s": np.array([wide_from(lane) for lane in lanes]),
-        "end_s": np.array([wide_until(lane) for lane in lanes]),
+        "start_s": np.array([wide[lane.id][0] for lane in lanes]),
+        "end_s": np.array([wide[lane.id][1] for lane in lanes]),
         "left": left,
         "right": right,
         "opposite": np.array([row_of(lane, lane.opposite) for lane in lanes]),
         "may_change_left": np.array([lane.may_change_left for lane in lanes]) & (left != NO_LANE),
         "may_change_right": np.array([lane.may_change_right for lane in lanes]) & (right != NO_LANE),
-        "beside_s": np.stack([_beside(lanes, rows, "left"), _beside(lanes, rows, "right")], -1),
+        "beside_s": np.stack([_beside(lanes, rows, side, wide) for side in ("left", "right")], -1),
         "successors": links("successors"),
         "predecessors": links("predecessors"),
         "lane_type": np.array([LANE_TYPES.index(lane.type) for lane in lanes]),
@@ -346,7 +347,12 @@ def _lane_tables(network: Network, lanes: list[Lane], neighbors: int) -> dict[st
     }
 
 
-def _beside(lanes: list[Lane], rows: Mapping[str, int], side: Literal["left", "right"]) -> Floats:
+def _beside(
+    lanes: list[Lane],
+    rows: Mapping[str, int],
+    side: Literal["left", "right"],
+    wide: Mapping[str, tuple[float, float]],
+) -> Floats:
     """Distance (m) on which the neighbour of each lane runs beside it.
 
     It is measured from the start of the lane to where the neighbour parts from it, or becomes too narrow. A
@@ -363,7 +369,7 @@ def _beside(lanes: list[Lane], rows: Mapping[str, int], side: Literal["left", "r
 
     length = np.array([lane.length for lane in lanes])
     names = [getattr(lane, side) for lane in lanes]
-    taper = [_taper(lanes[rows[name]]) if name in rows else 0.0 for name in names]
+    taper = [lanes[rows[name]].length - wide[name][1] if name in rows else 0.0 for name in names]
     found = np.where([name in rows for name in names], np.maximum(length - taper, 0.0), 0.0)
     on = [
         [rows[after] if goes_on(lane, after) else -1 for after in lane.successors if after in rows]
@@ -381,7 +387,7 @@ def _beside(lanes: list[Lane], rows: Mapping[str, int], side: Literal["left", "r
 
 
 def _lanes_behind(lanes: list[Lane], rows: Mapping[str, int]) -> int:
-    """Lanes behind its own that the longest vehicle can reach, at least 2."""
+    """Lanes behind its own on which a long vehicle lies, at least 2."""
     before = [[rows[name] for name in lane.predecessors if name in rows] for lane in lanes]
     short = [row for row, lane in enumerate(lanes) if lane.length < LONGEST]
     reach = {row: lanes[row].length for row in short}  # m, least length of a chain that ends there
@@ -400,11 +406,6 @@ def _approaches(network: Network) -> int:
     """Connectors that vehicles look at: as many as a way across a junction has, and two more."""
     pieces = max((sum(network.lanes[x].drivable for x in m.via) for m in network.movements), default=1)
     return min(max(pieces, 1), MOST_PIECES) + 2
-
-
-def _taper(lane: Lane) -> float:
-    """Length of the narrow end of a lane without successors, m."""
-    return lane.length - wide_until(lane)
 
 
 def _lanes_in_sight(lanes: list[Lane], rows: Mapping[str, int]) -> int:

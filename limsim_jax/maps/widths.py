@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 from numpy.typing import NDArray
 
-from limsim_jax.maps.network import Lane
+from limsim_jax.maps.network import Lane, Network
 
 MIN_WIDTH = 2.7
 """Least width of a lane for all vehicles, m: a bus is 2.55 m wide."""
@@ -21,26 +21,45 @@ NARROW_SHARE = 0.9
 """Share of its greatest width at which a lane counts as wide, where it nowhere has `MIN_WIDTH`."""
 
 
+def usable(network: Network) -> dict[str, tuple[float, float]]:
+    """Where drivable lanes are wide enough: from and to, m along them.
+
+    A lane counts from its start if traffic comes in there: from a lane before it that is wide at its end. In
+    the same way it counts to its end if a lane after it is wide at its start. Of a lane that is narrow as a
+    whole most of its own width is enough.
+    """
+    lanes = {lane.id: lane for lane in network.drivable_lanes()}
+    wide = {name: np.nonzero(lane.width >= wide_width(lane))[0] for name, lane in lanes.items()}
+    # a lane section within a taper: nowhere wide enough for a car, and it goes on as one that is
+    never = {
+        name
+        for name, lane in lanes.items()
+        if lane.width.max() < TOO_NARROW
+        and any(
+            other in lanes and lanes[other].road == lane.road and lanes[other].width.max() >= TOO_NARROW
+            for other in (*lane.predecessors, *lane.successors)
+        )
+    }
+
+    def opened(names: tuple[str, ...]) -> bool:
+        return any(name in lanes and name not in never for name in names)
+
+    found: dict[str, tuple[float, float]] = {}
+    for name, lane in lanes.items():
+        if name in never:
+            found[name] = lane.length, 0.0
+            continue
+        first, last = (float(lane.s[wide[name][k]]) for k in (0, -1))
+        found[name] = (
+            0.0 if opened(lane.predecessors) else first,
+            lane.length if opened(lane.successors) else last,
+        )
+    return found
+
+
 def wide_width(lane: Lane) -> float:
     """Width (m) at which a lane counts as wide: of a narrow lane most of its own."""
     return min(MIN_WIDTH, NARROW_SHARE * float(lane.width.max()))
-
-
-def wide_until(lane: Lane) -> float:
-    """Where a lane without successors becomes too narrow, m from its start.
-
-    For all other lanes it is their length.
-    """
-    wide = np.nonzero(lane.width >= wide_width(lane))[0]
-    if lane.successors or not len(wide) or wide[-1] == len(lane.width) - 1:
-        return lane.length
-    return float(lane.s[wide[-1]])
-
-
-def wide_from(lane: Lane) -> float:
-    """Where a lane without predecessors becomes wide enough, m from its start; 0 for all others."""
-    wide = np.nonzero(lane.width >= wide_width(lane))[0]
-    return 0.0 if lane.predecessors or not len(wide) else float(lane.s[wide[0]])
 
 
 def fits_cars(lane: Lane) -> Bool[NDArray[np.bool_], " M"]:

@@ -49,7 +49,10 @@ def lanes_behind(
 def body_place(
     lane_map: LaneMap, state: State, slot: Int[Array, " E"] | None = None
 ) -> tuple[Int[Array, " E"], Float[Array, " E"]]:
-    """Lane and arc length (m) of the centres of bodies, all or those in some slots."""
+    """Lane and arc length (m) of the centres of bodies.
+
+    All of them, or those in some slots.
+    """
     half = state.shape.length / 2
     if slot is None:
         return place_behind(lane_map, state.lane, state.previous, state.earlier, state.s - half)
@@ -64,8 +67,12 @@ def place_behind(
     earlier: Int[Array, "N P"],
     s: Float[Array, " N"],
 ) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
-    """Lane and arc length (m) of places that may lie on the lanes behind, where `s` < 0."""
+    """Lane and arc length (m) of places, also on lanes behind.
+
+    They do where `s` (m) is below 0.
+    """
     for behind in lanes_behind(lane_map, previous, earlier).T:
         back = (s < 0) & (behind != NO_LANE)
-        lane, s = jnp.where(back, behind, lane), jnp.where(back, s + lane_map.length[behind], s)
+        lane = jnp.where(back, behind, lane)
+        s = jnp.where(back, s + lane_map.length[behind], s)
     return lane, s

@@ -191,7 +191,7 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
     routes = lane_map.routes
     leads_on = (routes.next_lane != NO_LANE) | routes.is_goal  # [L, G], the same for all worlds
 
-    def nearest_of(which: Bool[Array, "L G"]) -> tuple[Int[Array, " L"], Bool[Array, " L"]]:
+    def nearest_of(which: Any) -> tuple[Int[Array, " L"], Bool[Array, " L"]]:
         nearest = jnp.argmin(jnp.where(which, routes.distance, jnp.inf), -1).astype(state.goal.dtype)
         return nearest, which.any(-1)
 

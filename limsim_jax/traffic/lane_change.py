@@ -242,7 +242,7 @@ def choose_lane(
     minds = (asks | (starts & towards)) & follower
     letting = jnp.full(n + 1, -1, jnp.int32).at[jnp.where(minds, pair.lag, n)].max(me)[:n]
     letting_gap = pair.lag_gap[letting]
-    # above walking speed also a driver beside it, who falls back
+    # above walking speed a vehicle beside it falls back, too
     beside = (letting_gap > -shape.length) & (state.v > LANE_CHANGES.yielding_speed)
     lets = (letting >= 0) & ((letting_gap > 0) | beside)
     letting_gap = jnp.maximum(letting_gap, room)

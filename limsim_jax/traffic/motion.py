@@ -130,7 +130,7 @@ def without(state: State, left: Bool[Array, " N"]) -> State:
 
 
 def _hand_over(lane_map: LaneMap, state: State, s: Float[Array, " N"]) -> tuple[State, Bool[Array, " N"]]:
-    """Move vehicles beyond the end of their lane to the next lane, with front bumpers at `s` (m)."""
+    """Move vehicles to the next lane where their fronts (m) are beyond."""
     routes = lane_map.routes
     way = jnp.where(routes.is_goal, _GOAL, routes.next_lane)  # one look-up instead of two
     lane, previous, earlier = state.lane, state.previous, state.earlier
@@ -158,9 +158,9 @@ def smooth_step(u: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 
 def _stalled(lane_map: LaneMap, state: State) -> State:
-    """Give up lane changes that stand at their start, unless the route asks for them.
+    """Give up lane changes that stand at their start: they block two lanes.
 
-    They block two lanes.
+    Those that the route asks for go on.
     """
     asked = jnp.sign(lane_map.routes.lanes_to_go[state.lane, state.goal]) == state.side
     stalls = ~asked & (state.side != 0) & ~state.crossed & state.active

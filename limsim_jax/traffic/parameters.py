@@ -333,7 +333,7 @@ class LaneChanging:
         3.0,
         "m/s",
         "speed above which a driver also lets in a vehicle that is still beside",
-        "chosen: in a queue nobody has to fall back",
+        "chosen: in a queue no vehicle has to fall back",
         (0.0, 10.0),
     )
     hardest: float = _number(

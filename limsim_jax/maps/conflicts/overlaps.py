@@ -270,12 +270,12 @@ class _Curves:
         if not len(p):
             return []
         if p[-1] - p[0] + 1 == len(p) and q[-1] - q[0] + 1 == len(q):
-            return [_Region(a, b, *map(int, (p[0], p[-1], q[0], q[-1])), reach)]
+            return [_Region(a, b, int(p[0]), int(p[-1]), int(q[0]), int(q[-1]), reach)]
         parts, count = cast("tuple[NDArray[np.int32], int]", label(near, structure=np.ones((3, 3))))
         found = []
         for part in range(1, count + 1):
             p, q = np.nonzero(parts == part)
-            found.append(_Region(a, b, *map(int, (p.min(), p.max(), q.min(), q.max())), reach))
+            found.append(_Region(a, b, int(p.min()), int(p.max()), int(q.min()), int(q.max()), reach))
         return found
 
     def distance(self, a: int, b: int) -> Floats:
@@ -291,7 +291,7 @@ class _Curves:
         return distance
 
     def sharpest(self, a: int) -> float:
-        """Largest turn (rad) within `_BEND`, also from and to where the curve ends."""
+        """Largest turn (rad) of a curve within `_BEND`."""
         heading = self.heading(a)
         s = self.s[a]
         return float(np.abs(np.interp(s + _BEND, s, heading) - heading).max())
