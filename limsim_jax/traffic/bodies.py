@@ -69,9 +69,11 @@ def place_behind(
 ) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
     """Lane and arc length (m) of places, also on lanes behind.
 
-    They do where `s` (m) is below 0.
+    Places with `s` (m) below 0 lie there.
     """
-    for behind in lanes_behind(lane_map, previous, earlier).T:
+    lanes = lanes_behind(lane_map, previous, earlier)
+    for k in range(lanes.shape[1]):
+        behind = lanes[:, k]
         back = (s < 0) & (behind != NO_LANE)
         lane = jnp.where(back, behind, lane)
         s = jnp.where(back, s + lane_map.length[behind], s)
