@@ -253,14 +253,17 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
     goal = state.goal[:, None]
     at_goal = lane_map.routes.is_goal[ahead.lane, goal]
     stuck = (lane_map.routes.next_lane[ahead.lane, goal] == NO_LANE) & ~at_goal & (ahead.lane != NO_LANE)
-    # a vehicle that changes lanes may use the taper; others keep room to start from a standstill
+    # a vehicle that changes lanes may use half of the taper, and all of it once it has crossed the border;
+    # others keep room to start from a standstill
     stopping = (state.v * state.v / (2 * DRIVING.end_braking))[:, None]
+    taper = lane_map.length[ahead.lane] - lane_map.end_s[ahead.lane]
     end = ahead.start + lane_map.length[ahead.lane] - DRIVING.end_gap
+    end = jnp.where(state.crossed[:, None], end, end - taper / 2)
     wide = ahead.start + lane_map.end_s[ahead.lane] - DRIVING.end_gap
     # at most half of a short lane: no vehicle waits before it, on a lane that it would block
     creep = LANE_CHANGES.creep_speed * state.driver.lane_change_time + state.driver.s0
     clear = (jnp.maximum(DRIVING.end_clear, creep) - DRIVING.end_gap)[:, None]
-    room = jnp.maximum(wide - clear, ahead.start + lane_map.length[ahead.lane] / 2)
+    room = jnp.minimum(jnp.maximum(wide - clear, ahead.start + lane_map.length[ahead.lane] / 2), wide)
     end = jnp.where((state.side == 0)[:, None], jnp.where(room > stopping, room, wide), end)
     end = jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
     # it matters from where a driver begins to brake for it
