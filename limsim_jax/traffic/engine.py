@@ -209,7 +209,8 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
     to_left = routes.lanes_to_go[lane, state.goal] < 0  # it wants to the right
     other, there = (jnp.where(to_left, x[lane], y[lane]) for x, y in zip(left, right, strict=True))
     goal = jnp.where(ends_well[lane], ahead[lane], other)
-    changes = stuck & (ends_well[lane] | there)
+    once = (state.status & int(Status.MISSED_ROUTE)) == 0  # from side to side and back it would never go
+    changes = stuck & (ends_well[lane] | (there & once))
     return replace(
         state,
         goal=jnp.where(changes, goal, state.goal),
@@ -253,18 +254,18 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
     goal = state.goal[:, None]
     at_goal = lane_map.routes.is_goal[ahead.lane, goal]
     stuck = (lane_map.routes.next_lane[ahead.lane, goal] == NO_LANE) & ~at_goal & (ahead.lane != NO_LANE)
-    # a vehicle that changes lanes may use half of the taper, and all of it once it has crossed the border;
-    # others keep room to start from a standstill
+    # a vehicle that leaves the lane may use half of the taper; others keep room to start from a standstill
     stopping = (state.v * state.v / (2 * DRIVING.end_braking))[:, None]
     taper = lane_map.length[ahead.lane] - lane_map.end_s[ahead.lane]
     end = ahead.start + lane_map.length[ahead.lane] - DRIVING.end_gap
-    end = jnp.where(state.crossed[:, None], end, end - taper / 2)
+    end = end - taper / 2
     wide = ahead.start + lane_map.end_s[ahead.lane] - DRIVING.end_gap
     # at most half of a short lane: no vehicle waits before it, on a lane that it would block
     creep = LANE_CHANGES.creep_speed * state.driver.lane_change_time + state.driver.s0
     clear = (jnp.maximum(DRIVING.end_clear, creep) - DRIVING.end_gap)[:, None]
     room = jnp.minimum(jnp.maximum(wide - clear, ahead.start + lane_map.length[ahead.lane] / 2), wide)
-    end = jnp.where((state.side == 0)[:, None], jnp.where(room > stopping, room, wide), end)
+    leaves = (state.side != 0) & ~state.crossed
+    end = jnp.where(leaves[:, None], end, jnp.where(room > stopping, room, wide))
     end = jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
     # it matters from where a driver begins to brake for it
     begins = state.v * (state.v / (2 * DRIVING.end_comfort) + DRIVING.end_sight) + state.driver.s0

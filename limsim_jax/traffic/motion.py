@@ -160,14 +160,15 @@ def smooth_step(u: Float[Array, "*b"]) -> Float[Array, "*b"]:
 def _stalled(lane_map: LaneMap, state: State) -> State:
     """Give up lane changes that stand at their start: they block two lanes.
 
-    Those that the route asks for go on.
+    Those that the route asks for go on while they leave a lane.
     """
     asked = jnp.sign(lane_map.routes.lanes_to_go[state.lane, state.goal]) == state.side
-    stalls = ~asked & (state.side != 0) & ~state.crossed & state.active
+    stalls = (state.crossed | ~asked) & (state.side != 0) & state.active
     stalls &= (jnp.abs(state.d) < LANE_CHANGES.stall_offset) & (state.waiting > LANE_CHANGES.stall_time)
     return replace(
         state,
         side=jnp.where(stalls, 0, state.side),
+        crossed=state.crossed & ~stalls,
         progress=jnp.where(stalls, 0, state.progress),
         shift=jnp.where(stalls, 0, state.shift),
     )

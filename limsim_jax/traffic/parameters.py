@@ -324,10 +324,14 @@ class LaneChanging:
         (0.0, 30.0),
     )
     stall_time: float = _number(
-        3.0, "s", "standing at the start of a lane change, after which it is given up", "chosen", (1.0, 30.0)
+        3.0, "s", "standing in a lane change, after which it is given up", "chosen", (1.0, 30.0)
     )
     stall_offset: float = _number(
-        0.3, "m", "from the middle of the lane, up to which that is possible", "chosen", (0.0, 1.0)
+        0.8,
+        "m",
+        "from the middle of the lane, up to which that is possible",
+        "chosen: a car does not reach into the way of one in the next lane",
+        (0.0, 1.0),
     )
     yielding_speed: float = _number(
         3.0,
