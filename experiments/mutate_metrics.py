@@ -2,6 +2,7 @@
 
     python experiments/mutate_metrics.py [--modules safety scores ...] [--every 10] [--jobs 2]
     python experiments/mutate_metrics.py --again --rest
+    python experiments/mutate_metrics.py --again --engine    (slow: survivors meet the tests of the engine, too)
 
 Five ways of being wrong, each applied wherever it can be (one place at a time):
 
@@ -111,6 +112,28 @@ SAME: dict[tuple[str, str, str], str] = {
     ("record", "meets_ego", "-1 → 1"): "the last axis of two is the second",
     ("record", "ego_step", "0 → 1"): "filled in by `EvaluateEgo._advance`",
     ("record", "conflict_zones", "1 → 2"): "before the lane in any case",
+    ("course", "aside", "shown * w → shown / w"): "only the sign counts, and without speed nothing moves",
+    ("course", "aside", "state.d * w → state.d / w"): "only the sign counts",
+    (
+        "course",
+        "aside",
+        "over & (state.d * w < 0) → over",
+    ): "over the line and outwards it leaves in any case",
+    (
+        "course",
+        "aside",
+        "state.active & jnp.where(free, leaves | over & (state.d * w < 0), state.side != 0) → "
+        "jnp.where(free, leaves | over & (state.d * w < 0), state.side != 0)",
+    ): "empty slots are not looked at",
+    ("course", "course", "-1 → 1"): "the last axis of two is the second",
+    ("course", "_ahead", "-1 → 1"): "the last axis of two is the second",
+    ("course", "_ahead", "0 → 1"): "where there is no lane, nothing lies beyond",
+    (
+        "course",
+        "_ahead",
+        "(along[:, :, None] > end[:, None, :-1]) & (way != NO_LANE)[:, None, 1:] → "
+        "along[:, :, None] > end[:, None, :-1]",
+    ): "a way that ends is as long as its last lane beyond it",
     ("measures.rss", "ResponsibilityDistances.update", "0.01 → 0.036000000000000004"): (
         "tolerance of rounding"
     ),
@@ -249,7 +272,7 @@ class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
         return self.source.encode()
 
 
-def _run(mutant: Mutant, tests: list[str]) -> None:
+def _run(mutant: Mutant, tests: list[str], engine: bool) -> None:
     """Run tests with a mutant; this process ends with pytest's exit status."""
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
@@ -258,17 +281,18 @@ def _run(mutant: Mutant, tests: list[str]) -> None:
 
     os.chdir(REPO)
     sys.meta_path.insert(0, _Mutated(mutant))
-    os._exit(pytest.main(["-q", "-x", "--tb=no", "-p", "no:cacheprovider", *tests]))
+    tier = ["-m", ""] if engine else []
+    os._exit(pytest.main(["-q", "-x", "--tb=no", "-p", "no:cacheprovider", *tier, *tests]))
 
 
-def survives(mutant: Mutant) -> bool:
+def survives(mutant: Mutant, engine: bool = False) -> bool:
     """Whether no test notices."""
     # forked from a process that has the slow imports behind it, but none of ours and no running JAX
     context = multiprocessing.get_context("forkserver")
     tests = [f"tests/metrics/test_{name}.py" for name in TESTS[mutant.module]]
-    process = context.Process(target=_run, args=(mutant, tests))
+    process = context.Process(target=_run, args=(mutant, tests, engine))
     process.start()
-    process.join(SLOWEST)
+    process.join(SLOWEST * (3 if engine else 1))
     if process.is_alive():
         process.kill()
         process.join()
@@ -315,6 +339,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="only every n-th mutant")
     parser.add_argument("--again", action="store_true", help="try those that survived, keep other results")
     parser.add_argument("--rest", action="store_true", help="try those not tried yet, keep other results")
+    parser.add_argument("--engine", action="store_true", help="with the tests that drive the engine")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()
     for name in ("every", "jobs"):
@@ -330,7 +355,7 @@ def main() -> None:
             kept.setdefault(row["module"], []).append(row)
     for module in options.modules:
         source = _path(module).read_text()
-        if not survives(Mutant(module, "", 0, "", "", 0, source)):
+        if not survives(Mutant(module, "", 0, "", "", 0, source), options.engine):
             parser.error(f"{module}: its tests fail without any mutant")
         known = {(row["function"], row["change"], row["nth"]): row["fate"] for row in kept.get(module, [])}
         anew = not (options.again or options.rest)
@@ -348,7 +373,7 @@ def main() -> None:
             before = known.get((mutant.function, mutant.change, mutant.nth))
             if before == "killed" or (before and not options.again):
                 return before
-            return "survived" if survives(mutant) else "killed"
+            return "survived" if survives(mutant, options.engine) else "killed"
 
         with ThreadPoolExecutor(options.jobs) as pool:
             for mutant, found in zip(chosen, pool.map(fate, chosen), strict=True):

@@ -220,6 +220,8 @@ def test_a_lane_change_ends_where_and_when_it_was_foretold():
     [
         (0.5, 0.05, 0, 0.0),  # within its lane: it keeps its offset
         (0.5, 0.05, 1, "left"),  # it signals
+        (0.5, 0.02, 1, "left"),  # also where it goes there slowly
+        (1.0, 0.02, 0, "left"),  # just over the line
         (0.5, -0.05, 1, 0.0),  # it signals and drives the other way
         (1.3, 0.05, 0, "left"),  # over the line
         (1.3, -0.05, 0, "back"),
@@ -257,5 +259,23 @@ def test_a_vehicle_behind_follows_on_a_lane_that_one_of_both_changes_to():
         assert how.follows.tolist() == [False, behind, False]
         assert how.leads.tolist() == [False, False, behind]
     joins = vehicles._replace(other=jnp.array([NO_LANE, lane, lane], jnp.int32))
-    how = seen(lane_map, jnp.int32(0), joins)
-    assert how.follows.tolist() == [False, True, False] and how.leads.tolist() == [False, False, True]
+    away = vehicles._replace(other=jnp.array([NO_LANE, *[int(lane_map.left[beside])] * 2], jnp.int32))
+    for turn in (0.0, 2.0, -2.5):  # whichever way the road runs
+        cos, sin = np.cos(turn), np.sin(turn)
+        turned = jnp.stack([cos * x - sin * y, sin * x + cos * y, heading + turn, *box[:, 3:].T], -1)
+        how = seen(lane_map, jnp.int32(0), joins._replace(box=turned.astype(box.dtype)))
+        assert how.follows.tolist() == [False, True, False] and how.leads.tolist() == [False, False, True]
+        how = seen(lane_map, jnp.int32(0), away._replace(box=turned.astype(box.dtype)))
+        assert not how.follows.any() and not how.leads.any(), "they change to another lane"
+
+
+@pytest.mark.parametrize("v", [1.0, 4.0, 20.0])
+def test_a_lane_change_in_a_queue_takes_as_long_as_the_way(v):
+    """Below 5 m/s a lane change goes on by distance: the slower the vehicle, the later it ends."""
+    lane_map, (lane, goal) = bundled("highway")[1], motorway()
+    state = state_of("highway", [lane] * 2, [100.0, 200.0], [v] * 2, [goal] * 2)
+    state = replace(state, side=jnp.array([1, 0], jnp.int32), progress=jnp.array([0.25, 0.0]))
+    how = jax.jit(aside)(lane_map, state)
+    to = float(width(lane_map, lane, 100.0) + width(lane_map, int(lane_map.left[lane]), 100.0)) / 2
+    assert float(how.to[0]) == pytest.approx(to, abs=1e-3)
+    assert float(how.pace[0]) == pytest.approx(min(v / 5.0, 1.0) * to / (0.75 * 4.5), rel=1e-4)
