@@ -279,3 +279,15 @@ def test_a_lane_change_in_a_queue_takes_as_long_as_the_way(v):
     to = float(width(lane_map, lane, 100.0) + width(lane_map, int(lane_map.left[lane]), 100.0)) / 2
     assert float(how.to[0]) == pytest.approx(to, abs=1e-3)
     assert float(how.pace[0]) == pytest.approx(min(v / 5.0, 1.0) * to / (0.75 * 4.5), rel=1e-4)
+
+
+def test_beyond_the_last_lane_a_vehicle_goes_straight_on():
+    """A vehicle 5 m before the end of its way meets a body 20 m behind that end."""
+    lane_map, (lane, _) = bundled("highway")[1], motorway()
+    end = float(lane_map.length[lane])
+    lanes, s = jnp.array([lane, lane], jnp.int32), jnp.array([end - 5.0, end - 1.0])
+    x, y, heading = pose(lane_map, lanes, jnp.array([end - 7.5, end + 20.0]))
+    box = jnp.stack([x, y, heading, jnp.full(2, 5.0), jnp.full(2, 1.9)], -1)
+    way = jnp.array([[lane, NO_LANE, NO_LANE]] * 2, jnp.int32)
+    how = seen(lane_map, jnp.int32(0), on_lanes(way, lanes, s, jnp.array([20.0, 0.0]), box))
+    assert float(how.meets[1]) == pytest.approx((27.5 - 5.0) / 20.0, abs=2 * _EVERY)
