@@ -107,10 +107,10 @@ def test_separate_stretches_are_separate_entries():
 
 
 def is_sharp(lane):
-    """Whether a body on it swings round on the spot: more than 1.5 rad within 5 m."""
+    """Whether a body on it swings round on the spot: more than 1.9 rad within 5 m."""
     s = np.linspace(0, lane.length, 400)
     heading = np.unwrap(lane.pose(s)[1])
-    return np.abs(np.interp(s + 5.0, s, heading) - heading).max() > 1.5
+    return np.abs(np.interp(s + 5.0, s, heading) - heading).max() > 1.9
 
 
 def brute_force(lane, foe, step=0.02):

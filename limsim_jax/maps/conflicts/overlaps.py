@@ -30,8 +30,8 @@ CLEARANCE = 3.5
 LONGEST = 12.0
 """Length (m) of the longest body that sweeps."""
 
-SHARPEST = 1.5
-"""Turn (rad) within `_BEND` above which a body swings round on the spot: a radius below 3.3 m."""
+SHARPEST = 1.9
+"""Turn (rad) within `_BEND` above which a body swings round on the spot: a U-turn of 2.6 m radius."""
 
 _SWING = 1.8  # m, by which the corners of a car stand out more when it turns on the spot than along its way
 _STEP = 0.25  # m, sampling of the centre lines
