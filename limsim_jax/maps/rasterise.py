@@ -387,7 +387,7 @@ def _beside(
 
 
 def _lanes_behind(lanes: list[Lane], rows: Mapping[str, int]) -> int:
-    """Lanes behind its own on which a long vehicle lies, at least 2."""
+    """Lanes behind its own that a long vehicle covers, at least 2."""
     before = [[rows[name] for name in lane.predecessors if name in rows] for lane in lanes]
     short = [row for row, lane in enumerate(lanes) if lane.length < LONGEST]
     reach = {row: lanes[row].length for row in short}  # m, least length of a chain that ends there

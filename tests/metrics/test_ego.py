@@ -264,6 +264,20 @@ def test_near_misses_are_episodes():
     assert (found["near_misses"], found["contacts"], found["nuplan_ttc"]) == (1.0, 1.0, 0.0)
 
 
+def test_each_near_miss_has_its_own_contacts():
+    """Two vehicles come close one after the other, and both are hit: neither is a near miss."""
+    r = record(61, (0, 0, 0, 10.0), [(0, 0, 0, 0.0)] * 2)
+    x = r["box"][:, 0, 0]
+    ttc = np.full((61, 2), 5.0)
+    ttc[5:16, 0] = ttc[40:51, 1] = 1.0
+    r["box"][:, 1:, 0] = x[:, None] + 10 * ttc + LENGTH
+    assert measure(r)["near_misses"] == 2.0
+    for k, step in ((0, 12), (1, 45)):
+        r["box"][step, k + 1, 0] = x[step] + LENGTH - 0.1
+    found = measure(r)
+    assert (found["contacts"], found["near_misses"]) == (2.0, 0.0)
+
+
 def test_a_near_miss_with_contacts_is_none():
     """Two are hit one after the other while the TTC to a third stays at 1 s."""
     far, x = record(41, (0, 0, 0, 10.0), [(0, 0, 0, 0.0)] * 3), LENGTH + 10.0
