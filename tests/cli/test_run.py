@@ -74,7 +74,10 @@ def test_summary_agrees_with_trace(ran):
 
 
 def test_positions_are_those_of_the_map_file(ran):
-    """The centre of a body lies half a length behind its front bumper, on its lane as the file has it."""
+    """The centre of a body lies half a length behind its front bumper, on its lane as the file has it.
+
+    In a bend of curvature kappa it lies kappa w^2 / 8 further in: both axles, w apart, are on the lane.
+    """
     network, trace = read_network(bundled_map("roundabout")), ran.trace
     checked = 0
     for k, slot in np.argwhere(trace["active"]):
@@ -84,7 +87,7 @@ def test_positions_are_those_of_the_map_file(ran):
         lane = network.lanes[str(trace["lane_ids"][trace["lane"][k, slot]])]
         place = np.asarray(lane.pose(s)[0]).reshape(-1)[:2]
         here = trace["x"][k, slot], trace["y"][k, slot]
-        np.testing.assert_allclose(here, place, atol=0.05)
+        np.testing.assert_allclose(here, place, atol=0.15)
         checked += 1
     assert checked > 100
 

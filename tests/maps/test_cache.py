@@ -276,7 +276,7 @@ def test_lane_map_is_kept_per_goals(file, folder, monkeypatch):
     calls = []
     build = rasterise.build_lane_map
 
-    def counted(network, goals=None, routes=None, *, report=None):
+    def counted(network, goals=None, routes=None, *, report=None, least=None):
         calls.append(goals)
         assert report is not None
         report.approximated("lane", "somewhere", "by 1 mm")
