@@ -216,6 +216,16 @@ def test_a_vehicle_that_closes_up_calmly_behind_a_standing_ego_is_no_near_miss(s
     assert found["near_misses"] == near and found["contacts"] == 0.0
 
 
+def test_less_than_a_metre_is_not_taken_for_one():
+    """With 1.5 m/s and 0.3 m left a vehicle has to brake with 3.75 m/s^2, with 1 m left with 1.1."""
+    v = np.maximum(1.5 - 4.5 * DT * np.arange(61), 0.0)
+    stop = float(np.sum(v[1:]) * DT)
+    r = record(61, (0, 0, 0, 0.0), [(-0.3 - LENGTH, 0, 0, v)])
+    assert stop < 0.25
+    r["follows"][:, 1] = True
+    assert measure(r)["near_misses"] == 1.0
+
+
 @pytest.mark.parametrize(("speed", "way", "near"), [(4.0, 10.0, 0.0), (14.0, 10.0, 1.0), (6.0, 3.0, 1.0)])
 @pytest.mark.parametrize("leader", [False, True])
 def test_an_ego_that_closes_up_calmly_behind_a_standing_vehicle_has_no_near_miss(speed, way, near, leader):
