@@ -227,6 +227,7 @@ class _Curves:
         self.owner: list[int] = []
         self.s: list[Floats] = []
         self.xyz: list[Floats] = []
+        self.direction: list[Floats] = []  # rad
         self.head: dict[int, int] = {}  # connector -> curve with its start
         self.tail: dict[int, int] = {}  # connector -> curve with its end
         for k, lane in enumerate(lanes):
@@ -242,7 +243,9 @@ class _Curves:
         s = np.linspace(start, end, max(2, math.ceil((end - start) / _STEP) + 1))
         self.owner.append(k)
         self.s.append(s)
-        self.xyz.append(lane.pose(s)[0])
+        xyz, heading = lane.pose(s)
+        self.xyz.append(xyz)
+        self.direction.append(np.unwrap(heading))
         return len(self.owner) - 1
 
     def boxes_meet(self, a: NDArray[np.int_], b: NDArray[np.int_], reach: float) -> Any:
@@ -258,8 +261,8 @@ class _Curves:
 
         Times l^2 it is how far the ends of a body of length l stand out.
         """
-        s = self.s[a]
-        heading = self.heading(a)
+        s, xy = self.s[a], self.xyz[a][:, :2]
+        heading = np.unwrap(np.arctan2(*np.gradient(xy, axis=0).T[::-1]))
         bend = np.interp(s + _BEND / 2, s, heading) - np.interp(s - _BEND / 2, s, heading)
         return (bend / _BEND / 8)[:, None] * np.stack([np.sin(heading), -np.cos(heading)], -1)
 
@@ -292,13 +295,8 @@ class _Curves:
 
     def sharpest(self, a: int) -> float:
         """Largest turn (rad) of a curve within `_BEND`."""
-        heading = self.heading(a)
-        s = self.s[a]
+        s, heading = self.s[a], self.direction[a]
         return float(np.abs(np.interp(s + _BEND, s, heading) - heading).max())
-
-    def heading(self, a: int) -> Floats:
-        """Direction of the curve at its samples, rad."""
-        return np.unwrap(np.arctan2(*np.gradient(self.xyz[a][:, :2], axis=0).T[::-1]))
 
     def refine(self, regions: Sequence[_Region]) -> Float[np.ndarray, "R 4"]:
         """s_in, s_out, f_in, f_out (m) of every region, interpolated between samples.
