@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from lxml import etree
 from mapbuilder.curves import Pose, wrap
+from mapbuilder.roads import text
+from mapbuilder.writer import add_connections
 
 from random_roads.junctions import Junction, Map
 from random_roads.roads import DRIVABLE, Contact, Cubics, Road
@@ -32,8 +35,7 @@ def write(m: Map, path: Path) -> None:
     path.write_bytes(etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True))
 
 
-def _text(x: float, digits: int = 9) -> str:
-    return f"{x:.{digits}f}".rstrip("0").rstrip(".") if abs(x) > 0.5 * 10**-digits else "0"
+_text = partial(text, digits=9)
 
 
 def _cubic(parent: etree._Element, tag: str, at: str, s: float, cubic: Sequence[float]) -> None:
@@ -165,14 +167,11 @@ def _beyond(road: Road, number: int, at: str, other: int) -> int | None:
 
 def _junction(junction: Junction) -> etree._Element:
     element = etree.Element("junction", id=str(junction.id), name=f"junction {junction.id}", type="default")
-    for number, (incoming, road, lanes) in enumerate(junction.links):
-        connection = etree.SubElement(element, "connection", id=str(number), incomingRoad=str(incoming.id))
-        connection.set("connectingRoad", str(road.id))
-        connection.set("contactPoint", "start")
-        for a, b in lanes:
-            etree.SubElement(connection, "laneLink", {"from": str(a), "to": str(b)})
-    for high, low in junction.priorities:
-        etree.SubElement(element, "priority", high=str(high.id), low=str(low.id))
+    add_connections(
+        element,
+        [(incoming.id, road.id, lanes) for incoming, road, lanes in junction.links],
+        [(high.id, low.id) for high, low in junction.priorities],
+    )
     for number in junction.controllers:
         etree.SubElement(element, "controller", id=str(number), type="0")
     return element

@@ -131,12 +131,8 @@ def without_gorges(network: Network) -> Network:
     for lane, begin, end in shut:
         message = f"no car fits from s = {begin:.1f} to {end:.1f} m: closed there"
         network.report.approximated("lane width", f"lane {lane.id}", message)
-    of = {lane.id for lane, _, _ in shut}
-    narrow = [
-        lane.id
-        for lane in found.drivable_lanes()
-        if lane.id.split("/")[0] in of and not fits_cars(lane)[len(lane.s) // 2]
-    ]
+    pieces = {name for lane, _, _ in shut for name in _pieces_of(found.lanes, lane.id)}
+    narrow = (name for name in pieces if not fits_cars(lane := found.lanes[name])[len(lane.s) // 2])
     return close(found, narrow, LaneType.NONE)
 
 
@@ -154,6 +150,14 @@ def _narrow(lane: Lane) -> list[tuple[float, float]]:
             found[-1] = found[-1][0], end
         else:
             found.append((begin, end))
+    return found
+
+
+def _pieces_of(lanes: Mapping[str, Lane], name: str) -> list[str]:
+    """The pieces of a lane, in its direction of travel."""
+    found = [name]
+    while (after := f"{name}/{len(found)}") in lanes:
+        found.append(after)
     return found
 
 

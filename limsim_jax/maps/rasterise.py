@@ -161,13 +161,13 @@ def build_lane_map(
         **{name: _pad(table, num_lanes, inert.get(name, _inert(table))) for name, table in tables.items()},
         **_grid(raster, rows, size),
     }
-    sight = max(_lanes_in_sight(lanes, lane_rows(network)), size["sight"])
+    order = lane_rows(network)
     rules = _rule_tables(network, goals, routes or {}, num_lanes, size, keep_foes="foes" in (least or {}))
     lane_map = LaneMap(
         **arrays,
         **rules,
-        lanes_in_sight=sight,
-        lanes_behind=max(_lanes_behind(lanes, lane_rows(network)), min(size["behind"], EARLIER + 1)),
+        lanes_in_sight=max(_lanes_in_sight(lanes, order), size["sight"]),
+        lanes_behind=max(_lanes_behind(lanes, order), min(size["behind"], EARLIER + 1)),
         approaches=max(_approaches(network), size["approaches"]),
     )
     return jax.tree.map(lambda array: jnp.asarray(_device_type(array)), lane_map)

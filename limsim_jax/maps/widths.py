@@ -75,9 +75,13 @@ def fits_cars(lane: Lane) -> Bool[NDArray[np.bool_], " M"]:
 
 def begins_narrow(lane: Lane) -> bool:
     """Whether no car fits where the lane begins; lanes that are narrow as a whole are driven as they are."""
-    return bool(lane.width[0] < min(TOO_NARROW, wide_width(lane)))
+    return _narrow_at(lane, 0)
 
 
 def ends_narrow(lane: Lane) -> bool:
     """Whether no car fits where the lane ends; lanes that are narrow as a whole are driven as they are."""
-    return bool(lane.width[-1] < min(TOO_NARROW, wide_width(lane)))
+    return _narrow_at(lane, -1)
+
+
+def _narrow_at(lane: Lane, sample: int) -> bool:
+    return bool(lane.width[sample] < min(TOO_NARROW, wide_width(lane)))

@@ -161,14 +161,9 @@ def reference_path(
       step: m between points.
     """
     slot = state.egos.slot if slot is None else slot
-    lane, s = center_lane(lane_map, state, slot)
+    lane, s = body_place(lane_map, state, slot)
     after = jnp.where(lane == state.lane[slot], NO_LANE, state.lane[slot])
     return path_from(lane_map, lane, s, state.goal[slot], points=points, step=step, after=after)
-
-
-def center_lane(lane_map: LaneMap, state: State, slot: Int[Array, " V"]) -> tuple[Array, Array]:
-    """Lane and arc length (m) of the centres of these bodies."""
-    return body_place(lane_map, state, slot)
 
 
 def beside(

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from limsim_jax.maps.lane_map import LaneMap, pose
 from limsim_jax.policies.base import Policy
 from limsim_jax.policies.perception import rules
-from limsim_jax.policies.reference import center_lane, path_from
+from limsim_jax.policies.reference import path_from
+from limsim_jax.traffic.bodies import body_place
 from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Control, Trajectory
 from limsim_jax.traffic.engine import Traffic
@@ -102,7 +103,7 @@ class FollowLane(Policy):
         slot = state.egos.slot
         _, decision = rules(config, self.traffic, lane_map, state, jnp.zeros_like(slot))
         a = accelerations(self.traffic.model, state, decision, jnp.zeros_like(state.s))[slot][:, None]
-        lane, s = center_lane(lane_map, state, slot)
+        lane, s = body_place(lane_map, state, slot)
         path = path_from(lane_map, lane, s, state.goal[slot], points=45, step=2.0)
         times = 0.2 * jnp.arange(11, dtype=jnp.float32)[None]
         v0, d0 = state.v[slot][:, None], state.d[slot][:, None]

@@ -257,8 +257,7 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
     # a vehicle that leaves the lane may use half of the taper; others keep room to start from a standstill
     stopping = (state.v * state.v / (2 * DRIVING.end_braking))[:, None]
     taper = lane_map.length[ahead.lane] - lane_map.end_s[ahead.lane]
-    end = ahead.start + lane_map.length[ahead.lane] - DRIVING.end_gap
-    end = end - taper / 2
+    end = ahead.start + lane_map.length[ahead.lane] - DRIVING.end_gap - taper / 2
     wide = ahead.start + lane_map.end_s[ahead.lane] - DRIVING.end_gap
     # at most half of a short lane: no vehicle waits before it, on a lane that it would block
     creep = LANE_CHANGES.creep_speed * state.driver.lane_change_time + state.driver.s0

@@ -168,14 +168,30 @@ def add_mark(lane: etree._Element, s: float, kind: str) -> None:
 def junction_element(junction: Junction) -> etree._Element:
     """A junction as XML."""
     element = etree.Element("junction", id=str(junction.id), name=junction.name, type="default")
-    for number, (incoming, road, lanes) in enumerate(junction.links):
-        connection = etree.SubElement(element, "connection", id=str(number), incomingRoad=str(incoming.id))
-        connection.set("connectingRoad", str(road.id))
-        connection.set("contactPoint", "start")
-        for a, b in lanes:
-            etree.SubElement(connection, "laneLink", {"from": str(a), "to": str(b)})
-    for high, low in junction.priorities:
-        etree.SubElement(element, "priority", high=str(high.id), low=str(low.id))
+    add_connections(
+        element,
+        [(incoming.id, road.id, lanes) for incoming, road, lanes in junction.links],
+        [(high.id, low.id) for high, low in junction.priorities],
+    )
     for sequence, controller in enumerate(junction.controllers):
         etree.SubElement(element, "controller", id=str(controller), type="0", sequence=str(sequence))
     return element
+
+
+def add_connections(
+    junction: etree._Element,
+    links: Sequence[tuple[int, int, Sequence[tuple[int, int]]]],
+    priorities: Sequence[tuple[int, int]],
+) -> None:
+    """Connections and priorities of a junction.
+
+    `links`: incoming and connecting road, and pairs of lanes on both. `priorities`: roads, the higher first.
+    """
+    for number, (incoming, road, lanes) in enumerate(links):
+        connection = etree.SubElement(junction, "connection", id=str(number), incomingRoad=str(incoming))
+        connection.set("connectingRoad", str(road))
+        connection.set("contactPoint", "start")
+        for a, b in lanes:
+            etree.SubElement(connection, "laneLink", {"from": str(a), "to": str(b)})
+    for high, low in priorities:
+        etree.SubElement(junction, "priority", high=str(high), low=str(low))

@@ -12,11 +12,11 @@ from limsim_jax.maps.lane_map import NO_LANE, pose, side_s, width
 from limsim_jax.policies.reference import (
     ReferencePath,
     beside,
-    center_lane,
     motion_on,
     path_from,
     to_cartesian,
 )
+from limsim_jax.traffic.bodies import body_place
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.motion import advance, boxes
 from limsim_jax.types import Config
@@ -46,7 +46,7 @@ def walk(lane_map, lane, s, goal, after=NO_LANE):
 def ways(name, seed, **more):
     state, lane_map = scattered(name, N, seed), bundled(name)[1]
     slot = jnp.arange(N)
-    lane, s = center_lane(lane_map, state, slot)
+    lane, s = body_place(lane_map, state, slot)
     path = jax.jit(lambda: path_from(lane_map, lane, s, state.goal, points=POINTS, step=STEP, **more))()
     return lane_map, state, lane, s, path
 
@@ -150,7 +150,7 @@ def test_motion_across_is_that_of_the_lane_change():
     first, _, _ = advance(tick, lane_map, state, zero)
     second, dx, _ = advance(tick, lane_map, first, zero)
     slot = jnp.arange(N)
-    lane, s = center_lane(lane_map, first, slot)
+    lane, s = body_place(lane_map, first, slot)
     path = path_from(lane_map, lane, s, first.goal, points=POINTS, step=STEP)
     found = motion_on(path, first, slot, first.d)
     np.testing.assert_allclose(found.d_v, (second.d - first.d) / tick.dt, atol=0.06)
@@ -165,7 +165,7 @@ def test_motion_of_free_egos_is_that_of_their_heading():
     egos = dataclasses.replace(egos, heading=egos.heading + jnp.array([0.1, -0.05]), steering=jnp.zeros(2))
     state = dataclasses.replace(state, egos=egos)
     slot = jnp.array([7, 3, 0])
-    lane, s = center_lane(lane_map, state, slot)
+    lane, s = body_place(lane_map, state, slot)
     path = path_from(lane_map, lane, s, state.goal[slot], points=POINTS, step=STEP)
     found = motion_on(path, state, slot, jnp.zeros(3))
     v = np.asarray(state.v)[[7, 3, 0]]

@@ -122,7 +122,7 @@ class Linker:
             return
         other = self.roads[link.id]
         section = 0 if end == "start" else len(road.sections) - 1
-        contact = link.contact
+        contact, index = link.contact, 0
         if link.s is None:
             contact = contact or self._nearest_end(road, end, other, where, link)
             index = 0 if contact == "start" else len(other.sections) - 1
@@ -136,7 +136,6 @@ class Linker:
                 if link.s is not None:
                     self._touch_inside(mine, other, target, link)
                     continue
-                index = 0 if contact == "start" else len(other.sections) - 1
                 self._touch(mine, (other.id, index, target, contact), lane.line)
 
     def _nearest_end(self, road: RawRoad, end: str, other: RawRoad, where: str, link: RoadLink) -> str:

@@ -18,8 +18,9 @@ from limsim_jax.policies.limsim_tm.plan import Lattice, Merge, Others, Task, pla
 from limsim_jax.policies.limsim_tm.search import Settings, no_plan, shifted
 from limsim_jax.policies.perception import Around, around, rules
 from limsim_jax.policies.predict import Prediction, Predictor, along_route, shared
-from limsim_jax.policies.reference import ReferencePath, beside, center_lane, motion_on, path_from
+from limsim_jax.policies.reference import ReferencePath, beside, motion_on, path_from
 from limsim_jax.policies.simple import FollowLane
+from limsim_jax.traffic.bodies import body_place
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Trajectory, at_slots
@@ -125,7 +126,7 @@ class LimSimTM(Policy):
         side = jnp.where(same, memory.side, 0)
         rule, decision = rules(config, self.traffic, lane_map, state, side)
         wish = rule
-        lane, s = center_lane(lane_map, state, slot)
+        lane, s = body_place(lane_map, state, slot)
         d, goal = state.d[slot], state.goal[slot]
 
         wall = decision.obstacles.gap[:, -1] - state.driver.s0
@@ -219,7 +220,7 @@ class LimSimTM(Policy):
                 lane_map, state, slot, drives, lane, jnp.where(side != 0, side, wish),
                 prediction.x[:, 0], prediction.y[:, 0], nearby.slot, counts,
             )  # fmt: skip
-            bodies, _ = center_lane(lane_map, state, jnp.arange(state.lane.shape[0]))
+            bodies, _ = body_place(lane_map, state)
             sides = at_slots(state.egos, side, state.side)
             new = decide_maneuvers(
                 settings, lane_map, state, slot, members, own, nearby.slot, prediction, bodies, sides, wall,
