@@ -281,6 +281,9 @@ def main() -> None:
     parser.add_argument("--out")
     parser.add_argument("--cores", type=int)
     options = parser.parse_args()
+    for name, least in (("maps", 1), ("first", 0), ("seeds", 1), ("seconds", 1)):
+        if not getattr(options, name) >= least:
+            parser.error(f"--{name} {getattr(options, name):g}: at least {least}")
     if options.final:
         options.first, options.maps = FINAL_FIRST, FINAL_MAPS
     elif max(options.pick or [options.first + options.maps - 1]) >= FINAL_FIRST:
