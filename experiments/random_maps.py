@@ -12,18 +12,22 @@ added as they are done, and a run that was broken off goes on where it was, unle
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import multiprocessing
+import os
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
-from random_roads import KINDS, Unfit, kind_of, write_map
-from random_roads.loads import LEVELS, SIZES, Loaded, demand_of, load
+from random_roads import KINDS, Unfit, kept_map, kind_of
+from random_roads.loads import LEVELS, SIZES, demand_of, load
 from watch import Watch, mirror_of, summary
 
 import limsim_jax
@@ -57,12 +61,13 @@ WORST = 12
 
 
 class Programs:
-    """Programs that run worlds on any map of a size class."""
+    """Programs that run worlds on any maps of a size class."""
 
-    def __init__(self, slots: int, worlds: int, seconds: float) -> None:
+    def __init__(self, slots: int, worlds: int, seconds: float, together: int) -> None:
         enable_compilation_cache()
         devices = jax.local_devices()
         self.chunk = -(-worlds // len(devices)) * len(devices)
+        self.worlds, self.together = worlds, together
         mesh = Mesh(np.array(devices), ("worlds",))
         config, traffic = Config(dt=0.1), Traffic()
 
@@ -77,66 +82,114 @@ class Programs:
             result, _ = run.advance(lane_map, *world)
             return result.totals, result.measures, {name: getattr(result.state, name) for name in SHOWN}
 
-        self.start: Any = over_worlds(start, mesh, run_once())
-        self.advance: Any = over_worlds(advance, mesh)
+        self.start: Any = over_worlds(jax.vmap(start, (0, None)), mesh, run_once())
+        self.advance: Any = over_worlds(jax.vmap(advance), mesh)
 
-    def run(self, shared: Any, worlds: int) -> tuple[Any, Any, Any]:
-        """Totals, counts and last vehicles of the worlds 0, 1, ... on the host."""
-        seeds = np.minimum(np.arange(self.chunk), worlds - 1).astype(np.int32)
+    def run(self, maps: Sequence[Any]) -> list[tuple[Any, Any, Any]]:
+        """Totals, counts and last vehicles of the worlds 0, 1, ... of each map, on the host."""
+        filled = [*maps, *[maps[-1]] * (self.together - len(maps))]
+        shared = jax.tree.map(lambda *x: np.stack(x), *filled)
+        seeds = np.minimum(np.arange(self.chunk), self.worlds - 1).astype(np.int32)
         found = jax.device_get(self.advance(shared, self.start(shared, seeds)))
-        return jax.tree.map(lambda x: x[:worlds], found)
+        return [jax.tree.map(lambda x: x[: self.worlds, m], found) for m in range(len(maps))]  # noqa: B023
 
     def compiled(self) -> int:
         """How many programs were compiled; two, unless shapes differ."""
         return self.start._cache_size() + self.advance._cache_size()
 
 
-class Measurement:
-    """Runs maps, with programs that maps of a size class share."""
+class Ready(NamedTuple):
+    """A map and its demand, before it runs."""
 
-    def __init__(self, folder: Path, worlds: int, seconds: float, *, blind: bool) -> None:
-        self.blind = blind  # rows do not say where faults happened
-        self.folder, self.worlds, self.seconds = folder, worlds, seconds
-        self.programs: dict[str, Programs] = {}
+    head: dict[str, Any]
+    """First columns of its row."""
+    size: str
+    shared: Any
+    """Lane map, demand and `mirror_of`, of NumPy arrays."""
+    ids: Sequence[str]
+    """Of the lanes."""
 
-    def rows(self, seed: int, levels: Sequence[str]) -> Iterator[dict[str, Any]]:
-        """A row per level of demand; a map that fails has rows that say why."""
-        head: dict[str, Any] = {"map": seed, "kind": kind_of(seed)}
+
+def prepare(seed: int, levels: Sequence[str], folder: Path, seconds: float) -> list[Ready | dict[str, Any]]:
+    """Draw a map, or take it from the folder, and sample its demands; a row that says why where it fails."""
+    head: dict[str, Any] = {"map": seed, "kind": kind_of(seed)}
+    begin = time.perf_counter()
+    try:
+        made = kept_map(seed, folder)
+        head |= {"of": made.of, "file": made.path.name}
+        loaded = load(read_network(made.path, cache=False))
+        ids, mirror = lane_ids(loaded.network), mirror_of(loaded.lane_map.conflicts)
+        head |= {"size": loaded.size, "load_s": round(time.perf_counter() - begin, 2)}
+    except Exception as error:
+        stage = (
+            "drawn" if isinstance(error, Unfit) else "refused" if isinstance(error, MapError) else "failed"
+        )
+        return [head | {"demand": level, stage: _one_line(error)} for level in levels]
+    found: list[Ready | dict[str, Any]] = []
+    for level in levels:
         begin = time.perf_counter()
         try:
-            made = write_map(seed, self.folder)
-            head |= {"of": made.of, "file": made.path.name}
-            loaded = load(read_network(made.path, cache=False))
-            head |= {"size": loaded.size, "load_s": round(time.perf_counter() - begin, 2)}
+            demand, rate = demand_of(loaded, level, seed, seconds)
+            shared = jax.tree.map(np.asarray, (loaded.lane_map, demand, mirror))
+            more = {"demand": level, "rate": round(rate), "initial": demand.initial}
+            more["prepare_s"] = round(time.perf_counter() - begin, 2)
+            found.append(Ready(head | more, loaded.size, shared, ids))
         except Exception as error:
-            stage = (
-                "drawn"
-                if isinstance(error, Unfit)
-                else "refused"
-                if isinstance(error, MapError)
-                else "failed"
-            )
-            for level in levels:
-                yield head | {"demand": level, stage: _one_line(error)}
-            return
-        for level in levels:
-            try:
-                yield head | {"demand": level} | self._measure(loaded, seed, level)
-            except Exception as error:
-                yield head | {"demand": level, "failed": _one_line(error)}
+            found.append(head | {"demand": level, "failed": _one_line(error)})
+    return found
 
-    def _measure(self, loaded: Loaded, seed: int, level: str) -> dict[str, Any]:
-        begin = time.perf_counter()
-        demand, rate = demand_of(loaded, level, seed, self.seconds)
-        size = SIZES.get(loaded.size)
-        if loaded.size not in self.programs or size is None:
-            slots = OWN_SLOTS if size is None else size.slots
-            self.programs[loaded.size] = Programs(slots, self.worlds, self.seconds)
-        programs = self.programs[loaded.size]
-        shared = jax.tree.map(np.asarray, (loaded.lane_map, demand, mirror_of(loaded.lane_map.conflicts)))
-        ready, before = time.perf_counter(), programs.compiled()
-        totals, counts, vehicles = programs.run(shared, self.worlds)
-        done = time.perf_counter()
+
+class Measurement:
+    """Runs maps, `together` at once, with programs that maps of a size class share."""
+
+    def __init__(self, worlds: int, seconds: float, together: int, *, blind: bool) -> None:
+        self.blind = blind  # rows do not say where faults happened
+        self.worlds, self.seconds, self.together = worlds, seconds, together
+        self.programs: dict[str, Programs] = {}
+
+    def rows(self, prepared: Iterable[Ready | dict[str, Any]]) -> Iterator[dict[str, Any]]:
+        """A row per map and level of demand, in the order in which they are done.
+
+        Maps that fit into no size class come last: each of them compiles programs of its own.
+        """
+        waiting: dict[str, list[Ready]] = {}
+        own: list[Ready] = []
+        for one in prepared:
+            if isinstance(one, dict):
+                yield one
+            elif one.size not in SIZES:
+                own.append(one)
+            else:
+                group = waiting.setdefault(one.size, [])
+                group.append(one)
+                if len(group) == self.together:
+                    yield from self._run(waiting.pop(one.size))
+        for group in [*waiting.values(), *([one] for one in own)]:
+            yield from self._run(group)
+
+    def _run(self, maps: list[Ready]) -> Iterator[dict[str, Any]]:
+        begin, size = time.perf_counter(), maps[0].size
+        try:
+            if size not in SIZES:
+                programs = Programs(OWN_SLOTS, self.worlds, self.seconds, 1)
+            elif size in self.programs:
+                programs = self.programs[size]
+            else:
+                programs = Programs(SIZES[size].slots, self.worlds, self.seconds, self.together)
+                self.programs[size] = programs
+            before = programs.compiled()
+            results = programs.run([one.shared for one in maps])
+        except Exception as error:
+            yield from (one.head | {"failed": _one_line(error)} for one in maps)
+            return
+        cost = {
+            "compiled": programs.compiled() - before,
+            "run_s": round((time.perf_counter() - begin) / len(maps), 2),
+        }
+        for one, result in zip(maps, results, strict=True):
+            yield one.head | self._row(one, *result) | cost
+
+    def _row(self, one: Ready, totals: Any, counts: Any, vehicles: Any) -> dict[str, Any]:
         bad = {
             "contact": totals.collided > 0,
             "against": counts[:, 1] > 0,
@@ -145,15 +198,10 @@ class Measurement:
             "broken": totals.broken > 0,
         }
         return {
-            "rate": round(rate),
-            "initial": demand.initial,
             "episodes": self.worlds,
             **{f"{name}_worlds": np.nonzero(which)[0].tolist() for name, which in bad.items()},
             **{name: value for name, value in summary(totals, counts).items() if name != "suspects"},
-            **({} if self.blind else places(lane_ids(loaded.network), totals, vehicles)),
-            "compiled": programs.compiled() - before,
-            "prepare_s": round(ready - begin, 2),
-            "run_s": round(done - ready, 2),
+            **({} if self.blind else places(one.ids, totals, vehicles)),
         }
 
 
@@ -280,14 +328,31 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "limsim_random_maps")
     parser.add_argument("--out")
     parser.add_argument("--cores", type=int)
+    parser.add_argument("--together", type=int, default=1, help="maps in one call; more on a GPU, such as 32")
+    parser.add_argument("--jobs", type=int, default=0, help="processes that read maps beside the worlds")
+    parser.add_argument("--draw", action="store_true", help="only write the maps into the folder")
     options = parser.parse_args()
-    for name, least in (("maps", 1), ("first", 0), ("seeds", 1), ("seconds", 1)):
+    for name, least in (
+        ("maps", 1),
+        ("first", 0),
+        ("seeds", 1),
+        ("seconds", 1),
+        ("together", 1),
+        ("jobs", 0),
+    ):
         if not getattr(options, name) >= least:
             parser.error(f"--{name} {getattr(options, name):g}: at least {least}")
     if options.final:
         options.first, options.maps = FINAL_FIRST, FINAL_MAPS
     elif max(options.pick or [options.first + options.maps - 1]) >= FINAL_FIRST:
         parser.error(f"maps from {FINAL_FIRST} on are for --final")
+    wanted = options.pick or range(options.first, options.first + options.maps)
+    seeds = [seed for seed in wanted if kind_of(seed) in options.kinds]
+    if options.draw:
+        for seed in seeds:
+            with contextlib.suppress(Unfit):  # is said when it runs
+                kept_map(seed, options.folder)
+        return
     use_all_cores(options.cores)
     file = RESULTS / f"{options.out or ('random_maps' if options.final else 'random_maps_work')}.json"
     here, package = Path(__file__).parent, Path(limsim_jax.__file__).parent
@@ -298,22 +363,40 @@ def main() -> None:
     rows = (
         {(r["map"], r["demand"]): r for r in kept.get("rows", [])} if kept.get("setting") == setting else {}
     )
-    wanted = options.pick or range(options.first, options.first + options.maps)
-    seeds = [seed for seed in wanted if kind_of(seed) in options.kinds]
-    measurement = Measurement(options.folder, options.seeds, options.seconds, blind=options.final)
+    todo = {seed: [x for x in options.demand if (seed, x) not in rows] for seed in seeds}
+    measurement = Measurement(options.seeds, options.seconds, options.together, blind=options.final)
     RESULTS.mkdir(exist_ok=True)
-    for seed in seeds:
-        todo = [level for level in options.demand if (seed, level) not in rows]
-        for row in measurement.rows(seed, todo):
-            rows[row["map"], row["demand"]] = row
-            write_whole(file, json.dumps({"setting": setting, "rows": list(rows.values())}, indent=1) + "\n")
-            print(_brief(row), flush=True)
+    for row in measurement.rows(_prepared(todo, options.folder, options.seconds, options.jobs)):
+        rows[row["map"], row["demand"]] = row
+        write_whole(file, json.dumps({"setting": setting, "rows": list(rows.values())}, indent=1) + "\n")
+        print(_brief(row), flush=True)
     shown = [rows[seed, level] for seed in seeds for level in options.demand if (seed, level) in rows]
     head = "Regenerate: `python experiments/random_maps.py" + (" --final" if options.final else "") + "`\n\n"
     head += f"{options.seeds} worlds of {options.seconds:g} s per map and demand.\n\n"
     text = head + report(shown, final=options.final)
     write_whole(file.with_suffix(".md"), text)
     print(text)
+
+
+def _prepared(
+    todo: dict[int, list[str]], folder: Path, seconds: float, jobs: int
+) -> Iterator[Ready | dict[str, Any]]:
+    """What runs, map by map; read by other processes, without an accelerator, where there are `jobs`."""
+    work = [(seed, levels, folder, seconds) for seed, levels in todo.items() if levels]
+    if not jobs:
+        for one in work:
+            yield from prepare(*one)
+        return
+    here = os.environ.get("JAX_PLATFORMS")
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        made = [pool.submit(prepare, *one) for one in work]
+        if here is None:
+            del os.environ["JAX_PLATFORMS"]
+        else:
+            os.environ["JAX_PLATFORMS"] = here
+        for each in made:
+            yield from each.result()
 
 
 def _brief(row: dict[str, Any]) -> str:

@@ -8,6 +8,8 @@ that overlap, is drawn anew from the next number of the same seed.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +19,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "maps"))  # of `mapbuilder`
 
+from limsim_jax.files import write_whole
 from random_roads import motorways, roundabouts, streets, sumo_nets
 from random_roads.junctions import Map, Unfit
 from random_roads.writer import footprint, write
@@ -104,6 +107,22 @@ def write_map(seed: int, folder: Path) -> RandomMap:
     raise Unfit(f"map {seed}: none of {TRIES} drawings is a sensible map, the last for {why}")
 
 
+def kept_map(seed: int, folder: Path) -> RandomMap:
+    """The map of a seed, from the folder if this code wrote it there before.
+
+    Raises:
+      Unfit: as `write_map`.
+    """
+    note = folder / f"{seed}.json"
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    code = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
+    if note.exists() and (kept := json.loads(note.read_text()))["code"] == code:
+        return RandomMap(seed, kind_of(seed), folder / kept["file"], kept["of"])
+    made = write_map(seed, folder)
+    write_whole(note, json.dumps({"code": code, "file": made.path.name, "of": made.of}))
+    return made
+
+
 def _draw(kind: str, rng: np.random.Generator, path: Path) -> None:
     m = DRAWN[kind](rng)
     _refuse_overlaps(m)
@@ -129,4 +148,4 @@ def _refuse_overlaps(m: Map) -> None:
             raise Unfit(f"roads {m.roads[a].name} and {m.roads[b].name} overlap")
 
 
-__all__ = ["DRAWN", "GENERATED", "KINDS", "RandomMap", "Unfit", "kind_of", "write_map"]
+__all__ = ["DRAWN", "GENERATED", "KINDS", "RandomMap", "Unfit", "kept_map", "kind_of", "write_map"]

@@ -113,7 +113,9 @@ def meet(
     arrival = travel_time(distance_in, me.v, me.top_speed, me.a)
     # it may stop inside the conflict area
     halts = (other.blocked > 0) | ((other.slowing > 0) & (other.line < -JUNCTIONS.margin))
-    cares = there & ~past & ~splits & ~((out + JUNCTIONS.gap_follow < arrival) & ~halts & ~merges)
+    clears = (out + JUNCTIONS.gap_follow < arrival) & ~merges
+    concerns = there & ~past & ~splits
+    cares = concerns & ~(clears & ~halts)
     # In a merge, follow the other where there is room behind it, and where that asks for less than to wait
     # before the conflict area, or before the junction if the vehicle could only just stop there.
     behind = (mine.end - me.front) - (theirs.end - other.front + other.length)
@@ -142,7 +144,12 @@ def meet(
     # First without delays: how long do vehicles that go first in any case keep the ones that stand? Then
     # with these delays, since so much later do they arrive.
     delay = jnp.where(halts | (other.yielding > 0), _UNKNOWN, out)
-    delay = jnp.where(cares & ~follows & ~goes_first(encounter, obstructing), delay, 0).max(0)
+    delayed = cares & ~follows & ~goes_first(encounter, obstructing)
+    # inside the junction a vehicle that waits for another may stop in the way of others
+    held = jnp.zeros(n, bool).at[vehicle].max((delayed & (me.line < -JUNCTIONS.margin)).any(0))
+    held = computed_once(held)[other.slot.astype(jnp.int32)]
+    cares |= concerns & clears & held
+    delay = jnp.where(delayed, delay, 0).max(0)
     delay = jnp.zeros(n, jnp.float32).at[vehicle].max(delay)
     delay = computed_once(jnp.where(state.v < JUNCTIONS.standstill, delay, 0))
     waits = cares & ~goes_first(encounter, obstructing, both(delay))
