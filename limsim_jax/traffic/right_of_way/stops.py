@@ -84,11 +84,11 @@ def exit_full(lane_map: LaneMap, state: State, approaches: Approaches, own: Pair
 def stop_signs(
     lane_map: LaneMap, state: State, approaches: Approaches
 ) -> tuple[Bool[Array, "N R"], Bool[Array, " N"]]:
-    """Stop signs still to be obeyed, and vehicles that have done so."""
+    """Stop signs still to be obeyed, and vehicles that have done so at the first one."""
     sign = lane_map.conflicts.must_stop[approaches.connector] & (approaches.line > -JUNCTIONS.margin)
-    near = approaches.line[:, 0] < JUNCTIONS.sign_distance
-    stopped = sign[:, 0] & (state.stopped | ((state.v < JUNCTIONS.sign_speed) & near))
-    return sign & ~(stopped[:, None] & (jnp.arange(sign.shape[1]) == 0)[None]), stopped
+    first = jnp.where(sign, approaches.line, NO_GAP).min(-1)
+    stopped = (first < JUNCTIONS.sign_distance) & (state.stopped | (state.v < JUNCTIONS.sign_speed))
+    return sign & ~(stopped[:, None] & (approaches.line <= first[:, None])), stopped
 
 
 def stops_at_conflicts(
