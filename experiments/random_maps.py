@@ -111,7 +111,10 @@ class Ready(NamedTuple):
 
 
 def prepare(seed: int, levels: Sequence[str], folder: Path, seconds: float) -> list[Ready | dict[str, Any]]:
-    """Draw a map, or take it from the folder, and sample its demands; a row that says why where it fails."""
+    """Draw a map and sample its demands.
+
+    A map that the folder has is not drawn again. Where one fails there is a row that says why.
+    """
     head: dict[str, Any] = {"map": seed, "kind": kind_of(seed)}
     begin = time.perf_counter()
     try:
@@ -140,7 +143,10 @@ def prepare(seed: int, levels: Sequence[str], folder: Path, seconds: float) -> l
 
 
 class Measurement:
-    """Runs maps, `together` at once, with programs that maps of a size class share."""
+    """Runs maps, `together` at once.
+
+    Maps of a size class share programs.
+    """
 
     def __init__(self, worlds: int, seconds: float, together: int, *, blind: bool) -> None:
         self.blind = blind  # rows do not say where faults happened
@@ -148,7 +154,7 @@ class Measurement:
         self.programs: dict[str, Programs] = {}
 
     def rows(self, prepared: Iterable[Ready | dict[str, Any]]) -> Iterator[dict[str, Any]]:
-        """A row per map and level of demand, in the order in which they are done.
+        """A row per map and level of demand, as they are done.
 
         Maps that fit into no size class come last: each of them compiles programs of its own.
         """

@@ -108,7 +108,7 @@ def write_map(seed: int, folder: Path) -> RandomMap:
 
 
 def kept_map(seed: int, folder: Path) -> RandomMap:
-    """The map of a seed, from the folder if this code wrote it there before.
+    """The map of a seed, drawn unless the folder has it.
 
     Raises:
       Unfit: as `write_map`.
