@@ -43,7 +43,8 @@ _calibration = "cleaning", "fit", "population", "uncertainty"
 _hooked += [f"limsim_jax.calibration.{name}" for name in _calibration]
 _hooked += [f"limsim_jax.calibration.closed_loop.{name}" for name in ("chains", "descent", "distances")]
 _hooked += [f"limsim_jax.recordings.{x}" for x in ("checks", "lanelets", "leaders", "openacc", "recording")]
-install_import_hook(_hooked, "shape_checks.typecheck")
+if os.environ.get("SHAPE_CHECKS", "1") != "0":  # they take a sixth of the time of tests that trace much
+    install_import_hook(_hooked, "shape_checks.typecheck")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -84,7 +84,7 @@ def exit_full(lane_map: LaneMap, state: State, approaches: Approaches, own: Pair
 def stop_signs(
     lane_map: LaneMap, state: State, approaches: Approaches
 ) -> tuple[Bool[Array, "N R"], Bool[Array, " N"]]:
-    """Stop signs still to be obeyed, and vehicles that have obeyed the first."""
+    """Stop signs to obey, and vehicles that have obeyed the first."""
     sign = lane_map.conflicts.must_stop[approaches.connector] & (approaches.line > -JUNCTIONS.margin)
     first = jnp.where(sign, approaches.line, NO_GAP).min(-1)
     stopped = (first < JUNCTIONS.sign_distance) & (state.stopped | (state.v < JUNCTIONS.sign_speed))
