@@ -112,8 +112,9 @@ def bundled_map(name: str) -> Path:
 
 def _read(path: Path, root: str) -> Network:
     from limsim_jax.maps.cut import without_gorges
+    from limsim_jax.maps.widths import without_blind_changes
 
-    return without_gorges(_read_file(path, root))
+    return without_blind_changes(without_gorges(_read_file(path, root)))
 
 
 def _read_file(path: Path, root: str) -> Network:

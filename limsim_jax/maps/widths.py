@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool
 from numpy.typing import NDArray
@@ -55,6 +57,30 @@ def usable(network: Network) -> dict[str, tuple[float, float]]:
             lane.length if opened(lane.successors) else last,
         )
     return found
+
+
+def without_blind_changes(network: Network) -> Network:
+    """The network without lane changes that no vehicle can make.
+
+    A lane beside opens where the own lane has already ended.
+    """
+    wide = usable(network)
+
+    def possible(lane: Lane, beside: str | None) -> bool:
+        if lane.id not in wide or beside not in wide:
+            return True
+        other = network.lanes[beside]
+        return wide[beside][0] / other.length <= wide[lane.id][1] / lane.length
+
+    found = {
+        lane.id: replace(
+            lane,
+            may_change_left=lane.may_change_left and possible(lane, lane.left),
+            may_change_right=lane.may_change_right and possible(lane, lane.right),
+        )
+        for lane in network.lanes.values()
+    }
+    return replace(network, lanes=found)
 
 
 def wide_width(lane: Lane) -> float:

@@ -21,8 +21,7 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s
 from limsim_jax.numerics import safe_divide
 from limsim_jax.traffic.collision import CLEARANCE, level
 from limsim_jax.traffic.ego import Trajectory, is_free
-from limsim_jax.traffic.motion import boxes, smooth_step
-from limsim_jax.traffic.parameters import LANE_CHANGES
+from limsim_jax.traffic.motion import boxes, creep_speed, smooth_step
 from limsim_jax.types import State
 from limsim_jax.xla import computed_once
 
@@ -287,12 +286,11 @@ def _along(
     lane, s = jnp.where(behind, came, lane), jnp.where(behind, s + lane_map.length[came], s)
 
     # lane changes proceed with time; other offsets fade
-    rate = safe_divide(jnp.minimum(state.v / LANE_CHANGES.creep_speed, 1), state.driver.lane_change_time)
+    slow = jnp.minimum(state.v / creep_speed(state), 1)
+    rate = safe_divide(slow, state.driver.lane_change_time)
     changes = start.changes[:, None]
     u = jnp.where(changes, state.progress[:, None], 0)
-    pace = jnp.where(
-        changes, rate[:, None], jnp.minimum(state.v / LANE_CHANGES.creep_speed, 1)[:, None] / SETTLE
-    )
+    pace = jnp.where(changes, rate[:, None], slow[:, None] / SETTLE)
     u = jnp.clip(u + pace * times[None], 0, 1)
     offset = jnp.where(start.changes, state.shift, state.d)[:, None]
     d = offset * (1 - smooth_step(u))

@@ -40,7 +40,7 @@ from limsim_jax.traffic.ego import (
     with_free,
 )
 from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, side_to_look, start
-from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes, without
+from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes, creep_speed, without
 from limsim_jax.traffic.neighbors import (
     Ahead,
     Obstacles,
@@ -205,7 +205,7 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
     lane = jnp.where(before, after, state.lane)
     to_end = lane_map.end_s[state.lane] - state.s
     near = to_end < jnp.where(before, NO_ROOM, DRIVING.end_room)
-    stuck = state.active & ~leads_on[lane, state.goal] & (state.waiting > patience) & near
+    stuck = state.active & ~leads_on[lane, state.goal] & (state.waiting > patience) & near & (state.side == 0)
     to_left = routes.lanes_to_go[lane, state.goal] < 0  # it wants to the right
     other, there = (jnp.where(to_left, x[lane], y[lane]) for x, y in zip(left, right, strict=True))
     goal = jnp.where(ends_well[lane], ahead[lane], other)
@@ -259,12 +259,16 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
     taper = lane_map.length[ahead.lane] - lane_map.end_s[ahead.lane]
     end = ahead.start + lane_map.length[ahead.lane] - DRIVING.end_gap - taper / 2
     wide = ahead.start + lane_map.end_s[ahead.lane] - DRIVING.end_gap
-    # at most half of a short lane: no vehicle waits before it, on a lane that it would block
-    creep = LANE_CHANGES.creep_speed * state.driver.lane_change_time + state.driver.s0
+    # a part of a short lane: no vehicle waits before it, on a lane that it would block
+    creep = creep_speed(state) * state.driver.lane_change_time + state.driver.s0
     clear = (jnp.maximum(DRIVING.end_clear, creep) - DRIVING.end_gap)[:, None]
-    room = jnp.minimum(jnp.maximum(wide - clear, ahead.start + lane_map.length[ahead.lane] / 2), wide)
+    count = jnp.maximum(jnp.abs(lane_map.routes.lanes_to_go[ahead.lane, goal]), 1).astype(clear.dtype)
+    part = ahead.start + lane_map.length[ahead.lane] / (count + 1)
+    room = jnp.minimum(jnp.maximum(wide - count * clear, part), wide)
+    # a vehicle that comes too fast for that place stops as soon as it can; one between lanes drives on
+    wait = jnp.where((state.side != 0)[:, None], wide, jnp.minimum(jnp.maximum(room, stopping), wide))
     leaves = (state.side != 0) & ~state.crossed
-    end = jnp.where(leaves[:, None], end, jnp.where(room > stopping, room, wide))
+    end = jnp.where(leaves[:, None], end, wait)
     end = jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
     # it matters from where a driver begins to brake for it
     begins = state.v * (state.v / (2 * DRIVING.end_comfort) + DRIVING.end_sight) + state.driver.s0
@@ -305,7 +309,7 @@ def _until_changed(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
     room = room_beside(lane_map, state.lane, state.s, other)
     time = jnp.maximum(state.driver.lane_change_time * (1 - state.progress), 0.1)
     # a much faster vehicle, as one that a planner has driven, does not brake hard for that
-    least = jnp.maximum(LANE_CHANGES.slowed * state.v, LANE_CHANGES.creep_speed)
+    least = jnp.maximum(LANE_CHANGES.slowed * state.v, creep_speed(state))
     return jnp.where(state.side != 0, jnp.maximum(LANE_CHANGES.on_time * room / time, least), NO_GAP)
 
 

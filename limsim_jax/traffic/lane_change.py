@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, room_beside, side_s, width
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
+from limsim_jax.traffic.motion import creep_speed
 from limsim_jax.traffic.neighbors import Obstacles, Pair
 from limsim_jax.traffic.parameters import LANE_CHANGES
 from limsim_jax.types import State
@@ -106,7 +107,7 @@ def place_beside(
     """The place beside every vehicle, and whether it may change there.
 
     It may not where road marks forbid it, in junctions, by vehicle class, during another change, or too
-    late to finish before the lanes part, or while the other lane is still narrow.
+    late to finish before the lanes part, or where the other lane is narrow.
 
     Args:
       lane_map: where.
@@ -124,11 +125,13 @@ def place_beside(
     # time to finish before the lanes part: mean speed while braking with two thirds of b
     time = state.driver.lane_change_time
     mean = jnp.maximum(state.v - state.driver.b * time / 3, LANE_CHANGES.slowed * state.v)
-    needed = jnp.maximum(mean, LANE_CHANGES.creep_speed) * time
+    needed = jnp.maximum(mean, LANE_CHANGES.way_over * creep_speed(state)) * time
     allowed &= room_beside(lane_map, state.lane, state.s, side) > needed
     # where it crosses the border, in the middle of the change, its rear is on a lane that is wide enough
     s = side_s(lane_map, state.lane, state.s, side)
     allowed &= s + needed / 2 - state.shape.length >= lane_map.start_s[lane]
+    # and it does not end on a lane that has become too narrow
+    allowed &= (s + needed <= lane_map.end_s[lane]) | (lane_map.end_s[lane] >= lane_map.length[lane])
     return jnp.where(allowed, lane, NO_LANE), s, allowed
 
 

@@ -151,6 +151,15 @@ def _hand_over(lane_map: LaneMap, state: State, s: Float[Array, " N"]) -> tuple[
     return replace(state, lane=lane, previous=previous, earlier=earlier, s=s), left
 
 
+def creep_speed(state: State) -> Float[Array, " N"]:
+    """Speed (m/s) below which lane changes go on by distance.
+
+    Above it they go on by time. A vehicle that stands does not slide aside.
+    """
+    way = jnp.maximum(LANE_CHANGES.least_way, LANE_CHANGES.long_way * state.shape.length)
+    return way / jnp.maximum(state.driver.lane_change_time, 0.1)
+
+
 def smooth_step(u: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Quintic from 0 to 1; its first two derivatives vanish at both ends."""
     u = jnp.clip(u, 0, 1)
@@ -192,7 +201,7 @@ def _move_sideways(config: Config, lane_map: LaneMap, state: State) -> State:
     """Continue lane changes: d follows a quintic; half-way the lane becomes the other one."""
     state = _turn_back(lane_map, _stalled(lane_map, state))
     changing = state.active & (state.side != 0)
-    rate = jnp.minimum(state.v / LANE_CHANGES.creep_speed, 1)
+    rate = jnp.minimum(state.v / creep_speed(state), 1)
     done = state.progress + rate * safe_divide(jnp.full_like(rate, config.dt), state.driver.lane_change_time)
     progress = jnp.where(changing, jnp.minimum(done, 1), 0)
     # a vehicle off the middle without a lane change, as after a planner has driven it, drifts back
@@ -235,7 +244,7 @@ def lateral_speed(state: State) -> Float[Array, " N"]:
     """Speed across the lane (m/s) of vehicles that change lanes."""
     u = jnp.clip(state.progress, 0, 1)
     slope = 30 * u * u * (1 - u) * (1 - u)
-    rate = safe_divide(jnp.minimum(state.v / LANE_CHANGES.creep_speed, 1), state.driver.lane_change_time)
+    rate = safe_divide(jnp.minimum(state.v / creep_speed(state), 1), state.driver.lane_change_time)
     return jnp.where(state.side != 0, -state.shift * slope * rate, 0)
 
 

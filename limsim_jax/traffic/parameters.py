@@ -327,11 +327,11 @@ class LaneChanging:
         3.0, "s", "standing in a lane change, after which it is given up", "chosen", (1.0, 30.0)
     )
     stall_offset: float = _number(
-        0.8,
+        1.0,
         "m",
         "from the middle of the lane, up to which that is possible",
-        "chosen: a car does not reach into the way of one in the next lane",
-        (0.0, 1.0),
+        "chosen: a car hardly reaches into the next lane",
+        (0.0, 1.5),
     )
     yielding_speed: float = _number(
         3.0,
@@ -355,12 +355,22 @@ class LaneChanging:
         "chosen: the comfortable deceleration of cars",
         (0.5, 4.0),
     )
-    creep_speed: float = _number(
-        5.0,
-        "m/s",
-        "speed below which a lane change goes on by distance, not by time",
-        "chosen: a vehicle that stands does not slide",
-        (1.0, 10.0),
+    least_way: float = _number(
+        12.0,
+        "m",
+        "least way of a lane change, at walking pace",
+        "a car with a turning radius R moves w aside in sqrt(4 R w - w^2), 8.5 to 11 m, and turns its wheels",
+        (8.0, 50.0),
+    )
+    way_over: float = _number(
+        0.75,
+        "1",
+        "share of that way which must be left before lanes part",
+        "a tenth of the way aside is left then: 1 - the quintic at 0.75",
+        (0.5, 1.0),
+    )
+    long_way: float = _number(
+        2.5, "1", "least way over the length of a long vehicle", "chosen: its rear swings little", (0.5, 5.0)
     )
     drift: float = _number(
         0.5,
@@ -442,7 +452,7 @@ class Driving:
         25.0,
         "m",
         "kept free before that end, to start a lane change from a standstill",
-        "chosen: the way of a lane change at `creep_speed`",
+        "chosen: twice `least_way`",
         (5.0, 100.0),
     )
     end_comfort: float = _number(

@@ -105,10 +105,24 @@ def test_no_lane_change_begins_without_room(v):
     _, lane_map, _ = town()
     time, b = (float(x[0]) for x in (drivers(1).lane_change_time, drivers(1).b))
     mean = max(v - b * time / 3, v / 2)  # it may brake gently to be done in time
-    needed = max(mean, 5.0) * time
+    needed = max(mean * time, 9.0)  # three quarters of the 12 m that it takes at walking pace
     for s, expected in ((102.0 - needed - 1, True), (102.0 - needed + 1, False)):
         state = vehicles(["in"], [s], [v], ["out_left"])
         assert bool(place_beside(lane_map, state, jnp.ones(1, jnp.int32))[2][0]) == expected
+
+
+def test_long_vehicles_need_more_room_and_no_change_ends_where_the_other_lane_has_closed():
+    _, lane_map, rows = town()
+    left = jnp.ones(1, jnp.int32)
+    for length, s, expected in ((5.0, 92.0, True), (12.0, 92.0, False), (12.0, 78.0, True)):
+        state = vehicles(["in"], [s], [0.0], ["out_left"])
+        state = dataclasses.replace(state, shape=shapes(1, length))
+        assert bool(place_beside(lane_map, state, left)[2][0]) == expected  # three quarters of 2.5 lengths
+    closed = lane_map.end_s.at[rows["in_left"]].set(60.0)
+    closes = dataclasses.replace(lane_map, end_s=closed)
+    for s, expected in ((50.0, True), (52.0, False)):
+        state = vehicles(["in"], [s], [0.0], ["out_left"])
+        assert bool(place_beside(closes, state, left)[2][0]) == expected
 
 
 def test_lane_change_is_finished_before_the_lanes_part():

@@ -2,7 +2,7 @@
 
 from small_xodr import lane, link, road, section
 
-from limsim_jax.maps.widths import usable
+from limsim_jax.maps.widths import usable, without_blind_changes
 
 
 def opening(width):
@@ -51,3 +51,15 @@ def test_roads_that_are_narrow_as_a_whole_are_driven(read):
     second = road("2", [section(0, right=[lane(-1, width=2.4)])], x=100.0)
     found = usable(read(first, second))
     assert found == {"1_0_-1": (0.0, 100.0), "2_0_-1": (0.0, 100.0)}
+
+
+def test_no_change_to_a_lane_that_opens_where_the_own_lane_has_ended(read):
+    """Lane -2 closes and -3 opens: it matters where whether a vehicle can change over."""
+    for begins, possible in ((60.0, False), (0.0, True)):
+        closing = lane(-2, inner=opening([(0, 3.5, 0.0), (20, 3.5, -0.07)]))
+        other = lane(-3, inner=opening([(0, 0, 0.0), (begins, 0, 3.5 / 30), (begins + 30, 3.5, 0)]))
+        network = read(road("1", [section(0, right=[lane(-1), closing, other])]))
+        assert usable(network)["1_0_-2"][1] < 35
+        found = without_blind_changes(network).lanes
+        assert found["1_0_-2"].may_change_right == possible
+        assert found["1_0_-3"].may_change_left and found["1_0_-1"].may_change_right, "the other way they can"

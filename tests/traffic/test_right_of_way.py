@@ -20,12 +20,13 @@ from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import phase_at
 from limsim_jax.simulation.rollout import Rollout, world_key
+from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Traffic, decide, drive
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.right_of_way import Approaches, passage, travel_time
-from limsim_jax.traffic.right_of_way.stops import stops_at_lights
+from limsim_jax.traffic.right_of_way.stops import stop_signs, stops_at_lights
 from limsim_jax.traffic.signals import DETECTOR, GAP, switch
 from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import default_population
@@ -289,6 +290,50 @@ def test_a_queue_on_a_merge_does_not_hide_vehicles_behind_it():
     # and the one that it follows is the last of them
     assert int(found.other[0, 2]) == 2
     assert float(found.gap[0, 2]) == pytest.approx(s_out - s_in + 0.3 - (f_out - f_in) + 2.0, abs=0.01)
+
+
+def test_a_vehicle_held_inside_a_junction_is_not_taken_to_clear_it():
+    """`a` would cross behind `b`, which has to wait for `c`, which stands further on in its way."""
+    lanes = []
+    for name, start, heading in (("a", (0, -20), 90.0), ("b", (-20, 0), 0.0), ("c", (12, -20), 90.0)):
+        h = np.deg2rad(heading)
+        before = np.array(start) - 40.0 * np.array([np.cos(h), np.sin(h)])
+        lanes += [straight("to_" + name, before, h, 40.0, successors=(name,))]
+        lanes += [straight(name, start, h, 60.0, road=name, junction="J")]
+    net = network(lanes)
+    comes = [("to_a", 39.0, 3.0), ("b", 21.5, 4.0)]
+    for stands, waits in ((("c", 21.0, 0.0), True), (("c", 50.0, 0.0), False)):
+        gap = np.asarray(obstacles_of(net, [*comes, stands], 4.5).gap)
+        assert (gap[0, 3] < 50) == waits
+        assert (gap[1, 3] < 50) == waits, "`b` itself waits for `c`"
+
+
+def test_a_stop_sign_behind_another_connector_counts_for_a_vehicle_that_stands_before_it():
+    """A road of 0.2 m between two junctions: vehicles stand before it, on a connector."""
+    lane_map = build_lane_map(intersection())
+    must_stop = jnp.zeros_like(lane_map.conflicts.must_stop).at[1].set(True)
+    lane_map = dataclasses.replace(
+        lane_map, conflicts=dataclasses.replace(lane_map.conflicts, must_stop=must_stop)
+    )
+    n = 3
+    found = Approaches(
+        connector=jnp.tile(jnp.array([0, 1], jnp.int32), (n, 1)), lane=jnp.zeros((n, 2), jnp.int32),
+        x=jnp.array([[6.0, -0.7], [6.0, -0.7], [-20.0, -30.0]]),
+        line=jnp.array([[-NO_GAP, 0.5], [-NO_GAP, 0.5], [20.0, 30.0]]),
+    )  # fmt: skip
+    nothing = jnp.zeros(n, jnp.int32)
+    state = start_state(
+        lane_map,
+        drivers(n),
+        shapes(n),
+        lane=nothing,
+        s=jnp.zeros(n),
+        v=jnp.array([0.0, 3.0, 0.0]),
+        goal=nothing,
+    )
+    sign, stopped = stop_signs(lane_map, state, found)
+    np.testing.assert_array_equal(stopped, [True, False, False])
+    np.testing.assert_array_equal(sign, [[False, False], [False, True], [False, True]])
 
 
 def test_a_vehicle_at_its_goal_does_not_run_into_one_that_has_just_left():

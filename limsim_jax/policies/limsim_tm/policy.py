@@ -26,7 +26,7 @@ from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Trajectory, at_slots
 from limsim_jax.traffic.engine import Decision, Traffic
 from limsim_jax.traffic.lane_change import urgency
-from limsim_jax.traffic.parameters import LANE_CHANGES
+from limsim_jax.traffic.motion import creep_speed
 from limsim_jax.types import Config, State
 from limsim_jax.xla import interval
 
@@ -171,7 +171,7 @@ class LimSimTM(Policy):
         fits = self._fits(state, slot, traffic, most, 0.3 - 0.2 * press)
         begins &= ((wish == look) | (need * look > 0)) & fits | ((rule == look) & (need * rule > 0))
         # optional changes do not begin shortly before a junction, where the vehicle would stop between lanes
-        v = jnp.maximum(state.v[slot], LANE_CHANGES.creep_speed)
+        v = jnp.maximum(state.v, creep_speed(state))[slot]
         inside = lane_map.is_connector[own.lane]  # along the path: roads may be in pieces before it
         junction = jnp.where(inside.any(-1), _STEP * jnp.argmax(inside, -1).astype(s.dtype), jnp.inf)
         near = junction <= v * state.driver.lane_change_time[slot] + _BEFORE_JUNCTION
@@ -251,10 +251,7 @@ class LimSimTM(Policy):
         there &= routes.distance[other, goal] <= routes.distance[lane, goal] + 1.0
         count = jnp.abs(routes.lanes_to_go[other, goal]).astype(s.dtype)
         time = 3 * state.driver.lane_change_time[slot] * (count + 1)
-        back = (
-            routes.change_distance[other, goal] - s
-            > jnp.maximum(state.v[slot], LANE_CHANGES.creep_speed) * time
-        )
+        back = routes.change_distance[other, goal] - s > jnp.maximum(state.v, creep_speed(state))[slot] * time
         fewer = count < jnp.abs(routes.lanes_to_go[lane, goal]).astype(s.dtype)
         return there & ((count == 0) | fewer | back)
 
