@@ -11,13 +11,16 @@ import numpy as np
 import pytest
 from paths import REPO
 
-from limsim_jax.sweeps import experiment
+from limsim_jax.sweeps import episode, experiment
 
 LONGEST = 10
 """Lines of a block without its imports."""
 
 HORIZON = 20.0
 """s, of bundled experiments: unoptimised code drives a whole episode in minutes."""
+
+SEEDS = 10
+"""Most seeds of a sweep, and its worlds per call: unoptimised code takes minutes for hundreds."""
 
 PAGES = [page for page in doc_blocks.pages() if page.mode != "none"]
 
@@ -47,8 +50,13 @@ def folder(tmp_path, monkeypatch):
         short[name] = tmp_path / ".bundled" / path.name
         short[name].write_text(re.sub(r"(?m)^horizon = .*$", f"horizon = {HORIZON}", path.read_text()))
     monkeypatch.setattr(experiment, "bundled_experiments", lambda: short)
+    monkeypatch.setitem(episode._CHUNKS, "cpu", SEEDS)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def _few_seeds(code):
+    return re.sub(r"\bseeds=(\d+)", lambda found: f"seeds={min(int(found[1]), SEEDS)}", code)
 
 
 @pytest.mark.parametrize("page", [_marked(page) for page in PAGES])
@@ -64,7 +72,7 @@ def test_blocks_of_a_page_run(page, folder, capsys):
     names = {"__name__": "__main__"}
     for line, code in page.blocks:
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as users have it
-            exec(compile("\n" * line + code, str(page.path), "exec"), names)
+            exec(compile("\n" * line + _few_seeds(code), str(page.path), "exec"), names)
     assert "Traceback" not in capsys.readouterr().out
 
 
