@@ -25,6 +25,7 @@ from limsim_jax.xla import (
     enable_compilation_cache,
     keep_program,
     load_program,
+    run_often,
     run_once,
     shared_program,
     without_compilation_cache,
@@ -41,7 +42,7 @@ def over_worlds(
     """A function of shared data and one world, for `[B, ...]` worlds.
 
     The batch is divided among the devices of the mesh. `consumes`: the arrays of the worlds are used for
-    those of the result, and are gone.
+    those of the result, and are gone. `compiler_options`: those of `run_often` by default.
     """
     everywhere, worlds = PartitionSpec(), PartitionSpec("worlds")
     many = jax.shard_map(
@@ -53,8 +54,8 @@ def over_worlds(
     )
     here, there = (NamedSharding(mesh, spec) for spec in (everywhere, worlds))
     return jax.jit(
-        many, in_shardings=(here, there), out_shardings=there, compiler_options=compiler_options,
-        donate_argnums=(1,) if consumes else (),
+        many, in_shardings=(here, there), out_shardings=there, donate_argnums=(1,) if consumes else (),
+        compiler_options=compiler_options or run_often(),
     )  # fmt: skip
 
 
