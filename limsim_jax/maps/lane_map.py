@@ -354,23 +354,29 @@ def _as_float(lane_map: LaneMap, value: Any) -> Float[Array, "*#b"]:
     return jnp.asarray(value, lane_map.rows.dtype)
 
 
+def _at(table: Array, index: Any) -> Array:
+    """The entries at indices that are there. Others are indexed alike, but XLA has more to compile."""
+    return jnp.asarray(table).at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
 def _columns(table: Float[Array, "S W"], row: Int[Array, "*#b"], columns: Iterable[int]) -> list[Any]:
     # One gather per column: XLA fuses them with the arithmetic; whole rows would go through memory first.
-    return [table[row, column] for column in columns]
+    return [_at(table, (row, x)) for x in columns]
 
 
 def _locate(
     lane_map: LaneMap, lane: Index, s: Float[Array, "*#b"]
 ) -> tuple[Int[Array, "*#b"], Float[Array, "*#b"]]:
     """Row of the interval at `s`, and distance from its start (m)."""
-    ds = lane_map.ds[lane]
-    index = jnp.clip(jnp.floor(s / ds).astype(jnp.int32), 0, lane_map.count[lane] - 1)
-    return computed_once((lane_map.first[lane] + index, s - index.astype(s.dtype) * ds))
+    lane = jnp.where(jnp.asarray(lane) < 0, lane + lane_map.ds.shape[0], lane)  # once, for all tables
+    ds, count, first = (_at(table, lane) for table in (lane_map.ds, lane_map.count, lane_map.first))
+    index = jnp.clip(jnp.floor(s / ds).astype(jnp.int32), 0, count - 1)
+    return computed_once((first + index, s - index.astype(s.dtype) * ds))
 
 
 def _inside(lane_map: LaneMap, row: Int[Array, "*#b"], u: Float[Array, "*#b"]) -> Float[Array, "*#b"]:
     # Not jnp.clip: its gradient on the bounds is a half.
-    end = lane_map.rows[row, 14]
+    (end,) = _columns(lane_map.rows, row, (14,))
     return jnp.where(u < 0, 0, jnp.where(u > end, end, u))
 
 

@@ -20,7 +20,7 @@ from limsim_jax.metrics.measures import built_in
 from limsim_jax.metrics.measures.comfort import Comfort
 from limsim_jax.metrics.measures.contacts import Contacts
 from limsim_jax.metrics.measures.progress import Progress
-from limsim_jax.metrics.motion import motion_flush, motion_result
+from limsim_jax.metrics.motion import motion_result
 from limsim_jax.metrics.reductions import Measured
 from limsim_jax.metrics.safety import Rss
 from limsim_jax.metrics.step import EgoStep, StepView
@@ -157,6 +157,7 @@ class EgoMetrics:
         duration = carry.now - carry.start
         gained = progress.to_go[0] - progress.to_go[1]
         completion = jnp.clip(safe_divide(gained, progress.to_go[0], 1.0), 0, 1)
+        comfort, rest = motion_result(self.dt, memory["motion"])
         failed = carry.broken | (contacts.contacts > 0) | road.left_road.found
         return Summary(
             started=carry.started,
@@ -180,7 +181,7 @@ class EgoMetrics:
             off_road=road.left_road.found,
             red_lights=memory["signals"].red_lights,
             stop_signs=memory["signals"].stop_signs,
-            comfortable=motion_result(self.dt, memory["motion"])["comfortable"],
-            rest=motion_flush(self.dt, memory["motion"])[1],
+            comfort=comfort,
+            rest=rest,
             reference_progress=reference_progress,
         )

@@ -118,7 +118,7 @@ class Summary(NamedTuple):
     off_road: Bool[Array, ""]  # at some time
     red_lights: Int[Array, ""]
     stop_signs: Int[Array, ""]
-    comfortable: Measured  # 1 within nuPlan's bounds
+    comfort: dict[str, Measured]  # the columns of `Comfort`
     rest: Filtered  # filtered values that the end of the record leaves
     reference_progress: Float[Array, ""] | None  # m, of nuPlan's expert, where it is given
 

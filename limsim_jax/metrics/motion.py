@@ -322,9 +322,12 @@ def _reduce(
     )
 
 
-def motion_result(dt: float, carry: MotionCarry) -> dict[str, Measured]:
-    """Extremes, root mean squares, and whether all quantities stay within `COMFORT`."""
-    carry, _ = motion_flush(dt, carry)
+def motion_result(dt: float, carry: MotionCarry) -> tuple[dict[str, Measured], Filtered]:
+    """Extremes, root mean squares, and whether all stay within `COMFORT`.
+
+    Also the values of `motion_flush`.
+    """
+    carry, rest = motion_flush(dt, carry)
     low, high, found = carry.least.value, -carry.most.value, carry.least.found
     results = {
         "min_acceleration": measured(low[0], found[0]),
@@ -339,4 +342,4 @@ def motion_result(dt: float, carry: MotionCarry) -> dict[str, Measured]:
         square = mean.result()
         results[f"rms_{name}"] = measured(safe_sqrt(square.value), square.valid)
     results["comfortable"] = measured(within.all().astype(low.dtype), found.all())
-    return results
+    return results, rest

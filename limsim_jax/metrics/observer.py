@@ -118,7 +118,7 @@ class EvaluateEgo:
         rows = state.egos.slot.shape[0]
         if self._last >= rows:
             raise ValueError(f"ego {self._last} is measured, but the world has {rows} egos")
-        first = self._record(lane_map, at_start(config, state))
+        first = self._record(lane_map, at_start(config, lane_map, state))
         any_ = jnp.ones(state.lane.shape[0], bool)
         never = jnp.full(any_.shape, NONE)  # no paths are known yet
         vehicles = any_, Course(meets=never, follows=~any_, leads=~any_)
@@ -300,7 +300,7 @@ class EvaluateTraffic:
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> TrafficCarry:
         """Everything as it is at the start."""
-        metrics, start = TrafficMetrics(config.dt), at_start(config, state)
+        metrics, start = TrafficMetrics(config.dt), at_start(config, lane_map, state)
         first = traffic_step(state, start.left, start.time, start.dx)
         return _flow(metrics, metrics.init(state.lane.shape[0], 0), first)
 

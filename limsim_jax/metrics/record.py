@@ -35,25 +35,26 @@ class Snapshot(NamedTuple):
     """A world after a physics step, or at its start; `N` slots."""
 
     state: State
+    box: Float[Array, "N 5"]  # as `motion.boxes`
     left: Bool[Array, " N"]  # has left at the end of its goal in this step
     off_road: Bool[Array, " N"]  # as `collision.off_road`
     time: Float[Array, ""]  # s since the start
     dx: Float[Array, " N"]  # m travelled in this step
 
 
-def at_start(config: Config, state: State) -> Snapshot:
+def at_start(config: Config, lane_map: LaneMap, state: State) -> Snapshot:
     """A world before the first step that counts: of the world, or of a fork."""
     no = state.active & False
     nothing = jnp.zeros(state.lane.shape[0], jnp.float32)
-    return Snapshot(state, no, no, config.time(state.step), nothing)
+    return Snapshot(state, boxes(lane_map, state), no, no, config.time(state.step), nothing)
 
 
 def after(lane_map: LaneMap, tick: Tick) -> Snapshot:
     """A world after a step. Looks for vehicles off the road where the engine has not."""
     off = tick.off_road
     if off is None:
-        off = off_road(lane_map, tick.state, boxes(lane_map, tick.state))
-    return Snapshot(tick.state, tick.left, off, tick.time, tick.dx)
+        off = off_road(lane_map, tick.state, tick.box)
+    return Snapshot(tick.state, tick.box, tick.left, off, tick.time, tick.dx)
 
 
 def traffic_step(
@@ -88,7 +89,7 @@ def ego_step(
     """
     state = snapshot.state
     slot = state.egos.slot[ego]
-    box = boxes(lane_map, state)
+    box = snapshot.box
     z = level(lane_map, state)
     seen = state.active & (jnp.abs(z - z[slot]) < CLEARANCE)  # a vehicle on a bridge is out of reach
     lane, v = state.lane[slot], state.v[slot]

@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.traffic.engine import Tick
-from limsim_jax.traffic.motion import boxes
 
 
 class Trace(NamedTuple):
@@ -55,7 +54,7 @@ def trace(lane_map: LaneMap) -> Callable[[Tick], Trace]:
             d=state.d,
             v=state.v,
             a=state.a,
-            box=boxes(lane_map, state),
+            box=tick.box,
             status=state.status,
             phase=state.lights.phase,
             vehicle_class=state.shape.vehicle_class,

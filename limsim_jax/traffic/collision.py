@@ -28,7 +28,6 @@ from limsim_jax.maps.lane_map import (
 )
 from limsim_jax.traffic.bodies import body_place
 from limsim_jax.traffic.ego import at_slots
-from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, State, Status
 from limsim_jax.xla import computed_once
 
@@ -301,7 +300,7 @@ def wrong_way(lane_map: LaneMap, state: State, box: Float[Array, "N 5"]) -> Bool
 
 
 def record(
-    config: Config, lane_map: LaneMap, state: State, *, free: bool = True
+    config: Config, lane_map: LaneMap, state: State, box: Float[Array, "N 5"], *, free: bool = True
 ) -> tuple[State, Bool[Array, " N"]]:
     """Record contacts, vehicles off the road, wrong ways and broken numbers.
 
@@ -312,12 +311,12 @@ def record(
       config: of the run.
       lane_map: where.
       state: the world.
+      box: as `motion.boxes`.
       free: False is for worlds without free egos.
 
     Returns:
       The state, and the vehicles off the road.
     """
-    box = computed_once(boxes(lane_map, state))
     touched = contacts(box, state.active, level(lane_map, state)).other
     hit = touched >= 0
     first = hit & (state.struck < 0)

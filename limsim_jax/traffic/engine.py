@@ -85,6 +85,7 @@ class Tick(NamedTuple):
     """What a physics step passes to the recorder."""
 
     state: State
+    box: Float[Array, "N 5"]  # as `motion.boxes`
     left: Bool[Array, " N"]  # has left at the end of its goal in this step
     off_road: Bool[Array, " N"] | None  # as `collision.off_road`; None: it is looked for at decisions only
     time: Float[Array, ""]  # s since the start, after the step
@@ -376,12 +377,15 @@ def drive(
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], Any]:
         state, x = carry
         state = replace(state, **fixed)
-        state, dx, left, off = _step(
+        state, dx, left, box, off = _step(
             config, traffic, lane_map, state, decision, x, command, broken, free, actions
         )
         x = x + dx
-        tick = Tick(state, left, off, config.time(state.step), decision, x, dx, command)
-        return (bare(state), x), None if record is None else record(tick)
+        if record is None:
+            return (bare(state), x), None
+        box = boxes(lane_map, state) if box is None else box
+        tick = Tick(state, box, left, off, config.time(state.step), decision, x, dx, command)
+        return (bare(state), x), record(tick)
 
     before, x = state, mapped_like(state.s, jnp.zeros_like(state.s))
     (state, _), records = lax.scan(step, (bare(state), x), None, length=config.decision_every)
@@ -389,7 +393,7 @@ def drive(
     if script is not None:
         state = replace(state, driver=replace(dry, lane_change_time=state.driver.lane_change_time))
     if traffic.look_for_contacts == "decision":
-        state, _ = record_events(config, lane_map, state, free=free)
+        state, _ = record_events(config, lane_map, state, boxes(lane_map, state), free=free)
     if state.egos.slot.shape[0]:
         state = sync(lane_map, state, boxes(lane_map, state))
     return _ran_red(lane_map, state, before), records
@@ -406,10 +410,13 @@ def _step(
     broken: Bool[Array, " E"],
     may_be_free: bool,
     actions: Actions | None,
-) -> tuple[State, Float[Array, " N"], Bool[Array, " N"], Bool[Array, " N"] | None]:
+) -> tuple[
+    State, Float[Array, " N"], Bool[Array, " N"], Float[Array, "N 5"] | None, Bool[Array, " N"] | None
+]:
     """One physics step, `x` m after the decision.
 
-    Returns the state, metres travelled, whether vehicles have left, and whether they are off the road.
+    Returns the state, metres travelled, and whether vehicles have left. If contacts are looked for, also the
+    bodies, and whether they are off the road.
     """
     egos = state.egos
     if actions is None:
@@ -446,10 +453,11 @@ def _step(
         gone = at_slots(egos, arrived(lane_map, moved), jnp.zeros_like(left), egos.free)
         moved, left = without(moved, gone), left | gone
     state = replace(moved, step=state.step + 1)
-    off = None
-    if traffic.look_for_contacts == "step":
-        state, off = record_events(config, lane_map, state, free=may_be_free)
-    return state, dx, left, off
+    if traffic.look_for_contacts != "step":
+        return state, dx, left, None, None
+    box = computed_once(boxes(lane_map, state))
+    state, off = record_events(config, lane_map, state, box, free=may_be_free)
+    return state, dx, left, box, off
 
 
 def _control(

@@ -51,7 +51,7 @@ def streamed(v, a, heading):
 
     t = jnp.arange(v.shape[0], dtype=v.dtype) * DT
     carry, _ = jax.lax.scan(step, motion_init(DT), (t, v, a, heading))
-    return motion_result(DT, carry)
+    return motion_result(DT, carry)[0]
 
 
 def measure(v, a, heading):

@@ -397,7 +397,7 @@ def test_comfort_is_nuplans():
         carry = motion_init(0.1)
         for k in range(41):
             carry, _ = update(carry, t[k], a[p, k], heading[p, k])
-        wanted.append(float(motion_result(0.1, carry)["comfortable"].value))
+        wanted.append(float(motion_result(0.1, carry)[0]["comfortable"].value))
     np.testing.assert_array_equal(found[:8], wanted)
     assert 0 < sum(wanted) < 8
 

@@ -177,6 +177,9 @@ def random_state(rng, slot: int, lane: int | None = None) -> State:
     )
 
 
+_boxes = jax.jit(boxes)
+
+
 def random_tick(rng, slot: int, lane: int | None = None) -> Tick:
     """A physics step that may have led to a random state, with leaders and ways to come."""
     state = random_state(rng, slot, lane)
@@ -193,6 +196,7 @@ def random_tick(rng, slot: int, lane: int | None = None) -> Tick:
     )  # fmt: skip
     return Tick(
         state=state,
+        box=_boxes(crossing(), state),
         left=rng.random(N) < 0.2,
         off_road=rng.random(N) < 0.2,
         time=f32(rng.uniform(0, 99)),

@@ -88,6 +88,7 @@ def test_another_policy_takes_the_wheel_and_gives_it_back(episodes, now):
         assert np.abs(np.diff(found.trace.box[0, :, ego, :2], axis=0)).max() < 1.6
 
 
+@pytest.mark.slow
 def test_places_of_planned_vehicles_stay_as_many():
     options = {"slots": 3, "around": "follow_lane"}
     ego = EgoTable(start="1-", s=40.0, goal="3+", policy="area_of_interest", options=options)

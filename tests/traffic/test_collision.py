@@ -154,7 +154,7 @@ def test_contacts_are_recorded_once_and_no_vehicle_is_removed():
     state = dataclasses.replace(
         state, active=state.active.at[3].set(False), v=state.v.at[4].set(jnp.nan), step=jnp.int32(7)
     )
-    record = jax.jit(lambda state: collision.record(CONFIG, lane_map, state)[0])
+    record = jax.jit(lambda state: collision.record(CONFIG, lane_map, state, boxes(lane_map, state))[0])
     once = record(state)
     hit = int(Status.COLLIDED)
     np.testing.assert_array_equal(once.status, [hit, hit, 0, 0, int(Status.NOT_FINITE)])
@@ -197,9 +197,9 @@ def test_gradients_pass_by_the_record():
     state = state_of("intersection", [row_on("intersection")] * 2, [30.0, 33.0], [5.0] * 2, [0] * 2)
 
     def loss(s):
-        return (
-            collision.record(CONFIG, lane_map, dataclasses.replace(state, s=s))[0].s * jnp.arange(1.0, 3.0)
-        ).sum()
+        there = dataclasses.replace(state, s=s)
+        after, _ = collision.record(CONFIG, lane_map, there, boxes(lane_map, there))
+        return (after.s * jnp.arange(1.0, 3.0)).sum()
 
     np.testing.assert_array_equal(jax.grad(loss)(state.s), [1.0, 2.0])
     box = boxes(lane_map, state)

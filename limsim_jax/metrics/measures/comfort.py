@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from limsim_jax.metrics.description import Better, Description, Plot
 from limsim_jax.metrics.measure import Derived, Measure, Summary
-from limsim_jax.metrics.motion import Filtered, MotionCarry, motion_init, motion_result, motion_update
+from limsim_jax.metrics.motion import Filtered, MotionCarry, motion_init, motion_update
 from limsim_jax.metrics.reductions import Measured
 from limsim_jax.metrics.step import StepView
 
@@ -91,4 +91,4 @@ class Comfort(Measure):
 
     def result(self, carry: MotionCarry, summary: Summary) -> dict[str, Measured]:
         """All columns."""
-        return motion_result(self.dt, carry)
+        return summary.comfort

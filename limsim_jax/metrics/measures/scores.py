@@ -124,7 +124,7 @@ class NuPlan(Measure):
                 ttc_within_bound=carry.ttc_kept,
                 overspeed=summary.overspeed,
                 duration=summary.duration,
-                comfortable=summary.comfortable.value > 0.5,
+                comfortable=summary.comfort["comfortable"].value > 0.5,
             )
         )
         found = found._replace(score=jnp.where(summary.broken, 0, found.score))
