@@ -368,7 +368,8 @@ def _locate(
     lane_map: LaneMap, lane: Index, s: Float[Array, "*#b"]
 ) -> tuple[Int[Array, "*#b"], Float[Array, "*#b"]]:
     """Row of the interval at `s`, and distance from its start (m)."""
-    lane = jnp.where(jnp.asarray(lane) < 0, lane + lane_map.ds.shape[0], lane)  # once, for all tables
+    lane = jnp.asarray(lane)
+    lane = jnp.where(lane < 0, lane + lane_map.ds.shape[0], lane)  # once, for all tables
     ds, count, first = (_at(table, lane) for table in (lane_map.ds, lane_map.count, lane_map.first))
     index = jnp.clip(jnp.floor(s / ds).astype(jnp.int32), 0, count - 1)
     return computed_once((first + index, s - index.astype(s.dtype) * ds))
