@@ -368,16 +368,16 @@ def _locate(
     lane_map: LaneMap, lane: Index, s: Float[Array, "*#b"]
 ) -> tuple[Int[Array, "*#b"], Float[Array, "*#b"]]:
     """Row of the interval at `s`, and distance from its start (m)."""
-    lane = jnp.asarray(lane)
-    lane = jnp.where(lane < 0, lane + lane_map.ds.shape[0], lane)  # once, for all tables
-    ds, count, first = (_at(table, lane) for table in (lane_map.ds, lane_map.count, lane_map.first))
+    k = jnp.asarray(lane)
+    k = jnp.where(k < 0, k + lane_map.ds.shape[0], k)  # once, for all tables
+    ds, count, first = (_at(table, k) for table in (lane_map.ds, lane_map.count, lane_map.first))
     index = jnp.clip(jnp.floor(s / ds).astype(jnp.int32), 0, count - 1)
     return computed_once((first + index, s - index.astype(s.dtype) * ds))
 
 
 def _inside(lane_map: LaneMap, row: Int[Array, "*#b"], u: Float[Array, "*#b"]) -> Float[Array, "*#b"]:
     # Not jnp.clip: its gradient on the bounds is a half.
-    (end,) = _columns(lane_map.rows, row, (14,))
+    end = _at(lane_map.rows, (row, 14))
     return jnp.where(u < 0, 0, jnp.where(u > end, end, u))
 
 
