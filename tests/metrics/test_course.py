@@ -271,14 +271,15 @@ def test_a_vehicle_behind_follows_on_a_lane_that_one_of_both_changes_to():
 
 @pytest.mark.parametrize("v", [1.0, 4.0, 20.0])
 def test_a_lane_change_in_a_queue_takes_as_long_as_the_way(v):
-    """Below 12 m in its time a lane change goes on by distance: the slower, the later it ends."""
+    """Below its least way in its time a lane change goes on by distance: the slower, the later it ends."""
     lane_map, (lane, goal) = bundled("highway")[1], motorway()
     state = state_of("highway", [lane] * 2, [100.0, 200.0], [v] * 2, [goal] * 2)
     state = replace(state, side=jnp.array([1, 0], jnp.int32), progress=jnp.array([0.25, 0.0]))
     how = jax.jit(aside)(lane_map, state)
     to = float(width(lane_map, lane, 100.0) + width(lane_map, int(lane_map.left[lane]), 100.0)) / 2
     assert float(how.to[0]) == pytest.approx(to, abs=1e-3)
-    assert float(how.pace[0]) == pytest.approx(min(v * 4.5 / 12.0, 1.0) * to / (0.75 * 4.5), rel=1e-4)
+    way = max(12.0, 2.5 * float(state.shape.length[0]))  # m
+    assert float(how.pace[0]) == pytest.approx(min(v * 4.5 / way, 1.0) * to / (0.75 * 4.5), rel=1e-4)
 
 
 def test_beyond_the_last_lane_a_vehicle_goes_straight_on():
