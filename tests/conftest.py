@@ -14,8 +14,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # false alarms of programs f
 # The older generator of fused loops compiles in a third of the time. Passes that find next to nothing here
 # take a quarter of the rest.
 _IDLE = "simplify-while-loops", "while-loop-invariant-code-motion", "while-loop-constant-sinking"
-_IDLE += "tree_reduction_rewriter", "simplify-conditional", "reshape-mover", "simplify-sorts"
-_IDLE += ("zero_sized_hlo_elimination",)
+_IDLE += "simplify-conditional", "reshape-mover", "simplify-sorts", "zero_sized_hlo_elimination"
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
