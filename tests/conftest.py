@@ -12,7 +12,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # false alarms of programs f
 # Most of the time of a test run is compilation, and most of that the optimisation of machine code, which
 # runs of a few seconds do not earn back. XLA's own passes, which decide what is computed, stay as they are.
 # The older generator of fused loops compiles in a third of the time. Passes that find next to nothing here
-# take a quarter of the rest.
+# take a fifth of the rest.
 _IDLE = "simplify-while-loops", "while-loop-invariant-code-motion", "while-loop-constant-sinking"
 _IDLE += "simplify-conditional", "reshape-mover", "simplify-sorts", "zero_sized_hlo_elimination"
 os.environ.setdefault(
