@@ -9,21 +9,22 @@ _cache = tempfile.TemporaryDirectory(prefix="limsim-jax-tests-")
 os.environ["LIMSIM_JAX_CACHE"] = _cache.name
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # false alarms of programs from the cache
-# Most of the time of a test run is compilation, and most of that the optimisation of machine code, which
-# runs of a few seconds do not earn back. XLA's own passes, which decide what is computed, stay as they are.
-# The older generator of fused loops compiles in a third of the time. Passes that find next to nothing here
-# take a fifth of the rest.
-_IDLE = "simplify-while-loops", "while-loop-invariant-code-motion", "while-loop-constant-sinking"
-_IDLE += "simplify-conditional", "reshape-mover", "simplify-sorts", "zero_sized_hlo_elimination"
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-    f" --xla_cpu_use_fusion_emitters=false --xla_disable_hlo_passes={','.join(_IDLE)}",
-)
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
+
+from limsim_jax.xla import IDLE_PASSES  # noqa: E402
+
+# Most of the time of a test run is compilation, and most of that the optimisation of machine code, which
+# runs of a few seconds do not earn back. XLA's own passes, which decide what is computed, stay but for those
+# that find next to nothing. The older generator of fused loops compiles in a third of the time. JAX reads
+# these flags with its first program.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    f" --xla_cpu_use_fusion_emitters=false --xla_disable_hlo_passes={','.join(IDLE_PASSES)}",
+)
 
 # Shapes and types of these modules are checked in every call. Only modules of functions: the pytrees
 # that JAX rebuilds with placeholders inside would not pass.

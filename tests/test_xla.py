@@ -3,6 +3,7 @@
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from limsim_jax.xla import (
     enable_compilation_cache,
     interval,
     mapped_like,
+    run_often,
     run_once,
 )
 
@@ -92,6 +94,19 @@ def test_a_batch_axis_that_is_last_gives_the_same_numbers():
     found = jax.vmap(batch_last(double), in_axes=(0, None))(x, jnp.ones(4))
     np.testing.assert_array_equal(found, 2 * x + 1)
     assert (4, 3) in seen
+
+
+def test_a_program_that_runs_often_is_compiled_without_idle_passes():
+    """One of them takes loops apart that turn once."""
+
+    def function(x):
+        return jax.lax.fori_loop(0, 1, lambda _, x: jnp.sin(x), x)
+
+    lowered = jax.jit(function).lower(jnp.arange(4.0))
+    if jax.default_backend() == "cpu":
+        options: list[Any] = [{"xla_disable_hlo_passes": ""}, run_often()]
+        every, some = (lowered.compile(x).as_text() or "" for x in options)
+        assert (every.count(" while("), some.count(" while(")) == (0, 1)
 
 
 def test_a_program_that_runs_once_is_compiled_without_optimisation():

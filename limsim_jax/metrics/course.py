@@ -18,7 +18,7 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, width
 from limsim_jax.metrics.safety import NONE, encounter, overlaps
 from limsim_jax.numerics import safe_divide
 from limsim_jax.traffic.ego import at_slots, is_free
-from limsim_jax.traffic.motion import creep_speed, lateral_speed
+from limsim_jax.traffic.motion import lateral_speed, pace
 from limsim_jax.types import State
 
 COURSE = 5.0
@@ -77,8 +77,8 @@ def aside(lane_map: LaneMap, state: State) -> Aside:
     to = jnp.where(side == 0, -state.d, to)
     goes = state.active & jnp.where(free, leaves | (over & (state.d * w < 0)), state.side != 0)
     left = (1 - state.progress) * state.driver.lane_change_time  # s, at least
-    pace = jnp.minimum(state.v / creep_speed(state), 1) * safe_divide(jnp.abs(to), left)
-    return Aside(to=jnp.where(goes, to, 0), pace=jnp.where(free, jnp.abs(w), pace))
+    across = pace(state) * safe_divide(jnp.abs(to), left)
+    return Aside(to=jnp.where(goes, to, 0), pace=jnp.where(free, jnp.abs(w), across))
 
 
 @jax.named_scope("course")

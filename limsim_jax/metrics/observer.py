@@ -300,8 +300,8 @@ class EvaluateTraffic:
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> TrafficCarry:
         """Everything as it is at the start."""
-        metrics, start = TrafficMetrics(config.dt), at_start(config, lane_map, state)
-        first = traffic_step(state, start.left, start.time, start.dx)
+        metrics, still = TrafficMetrics(config.dt), jnp.zeros_like(state.s)
+        first = traffic_step(state, still > 0, config.time(state.step), still)
         return _flow(metrics, metrics.init(state.lane.shape[0], 0), first)
 
     def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> TrafficStep:

@@ -21,7 +21,7 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s
 from limsim_jax.numerics import safe_divide
 from limsim_jax.traffic.collision import CLEARANCE, level
 from limsim_jax.traffic.ego import Trajectory, is_free
-from limsim_jax.traffic.motion import boxes, creep_speed, smooth_step
+from limsim_jax.traffic.motion import boxes, pace, smooth_step
 from limsim_jax.types import State
 from limsim_jax.xla import computed_once
 
@@ -286,15 +286,15 @@ def _along(
     lane, s = jnp.where(behind, came, lane), jnp.where(behind, s + lane_map.length[came], s)
 
     # lane changes proceed with time; other offsets fade
-    slow = jnp.minimum(state.v / creep_speed(state), 1)
+    slow = pace(state)
     rate = safe_divide(slow, state.driver.lane_change_time)
     changes = start.changes[:, None]
     u = jnp.where(changes, state.progress[:, None], 0)
-    pace = jnp.where(changes, rate[:, None], slow[:, None] / SETTLE)
-    u = jnp.clip(u + pace * times[None], 0, 1)
+    rate = jnp.where(changes, rate[:, None], slow[:, None] / SETTLE)
+    u = jnp.clip(u + rate * times[None], 0, 1)
     offset = jnp.where(start.changes, state.shift, state.d)[:, None]
     d = offset * (1 - smooth_step(u))
-    across = -offset * 30 * u * u * (1 - u) * (1 - u) * pace
+    across = -offset * 30 * u * u * (1 - u) * (1 - u) * rate
     x, y, heading = pose(lane_map, lane, s, d)
     return x, y, heading + jnp.arctan(jnp.clip(across / jnp.maximum(v, 0.5), -0.2, 0.2))
 

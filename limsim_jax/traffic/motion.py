@@ -160,6 +160,11 @@ def creep_speed(state: State) -> Float[Array, " N"]:
     return way / jnp.maximum(state.driver.lane_change_time, 0.1)
 
 
+def pace(state: State) -> Float[Array, " N"]:
+    """Share of their full pace at which lane changes go on: 1 from `creep_speed` on."""
+    return jnp.minimum(state.v / creep_speed(state), 1)
+
+
 def smooth_step(u: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Quintic from 0 to 1; its first two derivatives vanish at both ends."""
     u = jnp.clip(u, 0, 1)
@@ -201,7 +206,7 @@ def _move_sideways(config: Config, lane_map: LaneMap, state: State) -> State:
     """Continue lane changes: d follows a quintic; half-way the lane becomes the other one."""
     state = _turn_back(lane_map, _stalled(lane_map, state))
     changing = state.active & (state.side != 0)
-    rate = jnp.minimum(state.v / creep_speed(state), 1)
+    rate = pace(state)
     done = state.progress + rate * safe_divide(jnp.full_like(rate, config.dt), state.driver.lane_change_time)
     progress = jnp.where(changing, jnp.minimum(done, 1), 0)
     # a vehicle off the middle without a lane change, as after a planner has driven it, drifts back
@@ -244,7 +249,7 @@ def lateral_speed(state: State) -> Float[Array, " N"]:
     """Speed across the lane (m/s) of vehicles that change lanes."""
     u = jnp.clip(state.progress, 0, 1)
     slope = 30 * u * u * (1 - u) * (1 - u)
-    rate = safe_divide(jnp.minimum(state.v / creep_speed(state), 1), state.driver.lane_change_time)
+    rate = safe_divide(pace(state), state.driver.lane_change_time)
     return jnp.where(state.side != 0, -state.shift * slope * rate, 0)
 
 

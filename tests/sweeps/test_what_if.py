@@ -71,19 +71,19 @@ def test_policies_remember_and_totals_begin_anew(episodes, now):
     assert 0 < found.totals.time.max() <= 8.01  # s, of 8 vehicles in 1 s
 
 
-def nothing_jumps(found, start):
+def check_that_nothing_jumps(found, start):
     ego = found.state.egos.slot[0, 0]
     first = np.asarray(found.trace.box[0, 0, ego, :2])
     there = np.asarray([start.carry.state.egos.x[0, 0], start.carry.state.egos.y[0, 0]])
     np.testing.assert_allclose(first, there, atol=1.6)  # m, within 0.1 s at 15 m/s
-    return np.abs(np.diff(found.trace.box[0, :, ego, :2], axis=0)).max() < 1.6
+    assert np.abs(np.diff(found.trace.box[0, :, ego, :2], axis=0)).max() < 1.6
 
 
 def test_a_policy_gives_the_wheel_back(episodes, now):
     worlds = rows(now[0], [1])
     meek = futures(episodes.under(LikeTraffic()), worlds, 8, same=False)
     assert meek.trace.plan is None and not bool(meek.state.egos.free[0, 0])
-    assert nothing_jumps(meek, worlds)
+    check_that_nothing_jumps(meek, worlds)
 
 
 @pytest.mark.slow
@@ -94,7 +94,7 @@ def test_another_policy_takes_the_wheel(episodes):
     fast = futures(traffic.under(ConstantSpeed(speed=15.0)), before, 8, same=False)
     ego = fast.state.egos.slot[0, 0]
     assert bool(fast.state.egos.free[0, 0]) and abs(fast.trace.v[0, -1, ego] - 15.0) < 0.1
-    assert nothing_jumps(fast, before)
+    check_that_nothing_jumps(fast, before)
 
 
 @pytest.mark.slow
