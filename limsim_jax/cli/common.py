@@ -37,7 +37,7 @@ def path(file: str) -> Path:
     """The file, or the bundled map of this name."""
     from limsim_jax.maps import bundled_map
 
-    return path if (path := Path(file)).exists() or len(path.parts) > 1 else bundled_map(file)
+    return path if (path := Path(file)).is_file() or len(path.parts) > 1 else bundled_map(file)
 
 
 def load(file: str, no_cache: bool) -> Network:

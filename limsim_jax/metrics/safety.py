@@ -32,6 +32,9 @@ NONE = 1e6
 FORESIGHT = 1000.0
 """s: a contact later than this is none."""
 
+STILL = 1e-4
+"""m/s: bodies with a lower relative speed along an axis do not move along it. Rounding alone makes 1e-5."""
+
 NEAR_MISS = (1.5, 2.0)
 """s: a near miss begins when the TTC falls below the first and ends when it exceeds the second."""
 
@@ -158,12 +161,15 @@ def contact_interval(e: Encounter) -> tuple[Float[Array, "*b"], Float[Array, "*b
     """
     # Fractions are compared by cross multiplication, and divided last: one division instead of four, and
     # XLA keeps the result of a division instead of computing it again for each use.
+    # Compilers may compute a speed twice and round it differently. So its sign, which is that of its error
+    # where bodies stand still, does not matter there: bodies apart stay apart, and the others in touch.
     begins, ceases = [], []
     for offset, speed, extent in zip(*_axes(e), strict=True):
+        still, far = jnp.abs(speed) < STILL, jnp.abs(offset)
         toward = jnp.where(speed < 0, -offset, offset)
-        fast = greater(jnp.abs(speed), jnp.full_like(speed, 1e-9))
-        begins.append((-extent - toward, fast))
-        ceases.append((extent - toward, fast))
+        fast = jnp.where(still, 1e-9, jnp.abs(speed))
+        begins.append((jnp.where(still, far, -toward) - extent, fast))
+        ceases.append((extent - jnp.where(still, far, toward), fast))
     begin, cease = begins[0], ceases[0]
     for one, other in zip(begins[1:], ceases[1:], strict=True):
         begin = _pick(one[0] * begin[1] > begin[0] * one[1], one, begin)

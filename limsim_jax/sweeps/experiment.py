@@ -208,7 +208,7 @@ def read_experiments(
       ExperimentError: with the file and the field.
     """
     path = Path(path)
-    if not path.exists() and path.name == str(path):
+    if not path.is_file() and path.name == str(path):  # a folder of results may have the name of one
         known = bundled_experiments()
         if path.stem not in known:
             raise ExperimentError(

@@ -15,6 +15,7 @@ from limsim_jax.metrics.safety import (
     distance,
     drac,
     encounter,
+    first_touch,
     mirrored,
     overlaps,
     pet_init,
@@ -145,6 +146,18 @@ def test_a_contact_has_an_end():
     # in the way from 1.45 s (its front) and the ego from 1.325 s; the ego has passed at 1.675 s
     assert float(begin) == pytest.approx(1.45, rel=1e-5)
     assert float(cease) == pytest.approx(1.675, rel=1e-5)
+
+
+def test_rounding_of_a_speed_that_is_zero_changes_nothing():
+    # Compilers compute a speed twice, with different errors: the begin may see one, the end the other.
+    beside = (20.0, 6.0, 0.0, 5.0, 2.0), (10.0, 0.0)
+    ahead = (20.0, 1.0, 0.0, 5.0, 2.0), (10.0, 0.0)
+    for (other, velocity), meets in ((beside, False), (ahead, True)):
+        e = pair(EGO, (20.0, 0.0), other, velocity)
+        noisy = [e._replace(w=f(w)) for w in (-1e-5, -1e-9, 0.0, 1e-9, 1e-5)]
+        times = [contact_interval(e) for e in noisy]
+        found = {float(first_touch(begin, cease)) for begin, _ in times for _, cease in times}
+        assert found == ({float(ttc_2d(e))} if meets else {NONE})
 
 
 def test_mirrored_twice_is_the_same():

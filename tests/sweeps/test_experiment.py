@@ -6,6 +6,8 @@ import pytest
 from paths import REPO
 from traffic_worlds import bundled
 
+from limsim_jax.cli import common
+from limsim_jax.maps import bundled_maps
 from limsim_jax.maps.lane_map import lane_ids
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import ExperimentError, bundled_experiments, read_experiments
@@ -175,6 +177,16 @@ def test_what_is_wrong_is_named_in_one_line(write, old, new, message):
             Episodes(experiment)
     text = str(caught.value)
     assert "\n" not in text and "mine" in text
+
+
+def test_a_folder_is_no_experiment_and_hides_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("roundabout", "mine"):
+        (tmp_path / name).mkdir()
+    assert read_experiments("roundabout")[0].name == "roundabout"
+    assert common.path("roundabout") == bundled_maps()["roundabout"]
+    with pytest.raises(ExperimentError, match="mine: no such file, and no bundled experiment"):
+        read_experiments("mine")
 
 
 def test_lists_of_experiments(write):
