@@ -104,6 +104,19 @@ def test_places_that_the_contributing_page_names_exist():
             assert (REPO / place).exists() or (REPO / "limsim_jax" / place).exists(), place
 
 
+def test_tests_that_a_page_names_exist():
+    page = (REPO / "docs/results/mistakes.md").read_text()
+    commands = re.findall(r"`(tests/[^`]+)`", page)
+    assert len(commands) > 20
+    for command in commands:
+        places, _, wanted = command.partition(" -k ")
+        files = [path for place in places.split() for path in sorted(REPO.glob(f"{place}/**/test_*.py"))]
+        files += [REPO / place for place in places.split() if place.endswith(".py")]
+        tests = re.findall(r"def (test_\w+)", "".join(path.read_text() for path in files))
+        for word in wanted.strip('"').split(" or "):
+            assert any(word in test for test in tests), f"{command}: no test '{word}'"
+
+
 def test_the_english_is_plain():
     command = [sys.executable, ".ci/prose.py", *(str(path.relative_to(REPO)) for path in TOP), "docs"]
     found = subprocess.run(command, cwd=REPO, capture_output=True, text=True)
