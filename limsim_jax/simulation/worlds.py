@@ -100,7 +100,7 @@ class Worlds:
             result, carry = run.advance(lane_map, *world, decisions)
             return world._replace(carry=carry), result
 
-        sampling, running = names
+        self.names = sampling, running = names
         self._advance_name = None if running is None else f"{running} {self.chunk} {_shapes(lane_map)}"
         self._start_name = None if sampling is None or running is None else f"{self._advance_name} {sampling}"
         self._start_jit: Any = over_worlds(start, self.mesh, run_once())

@@ -133,8 +133,9 @@ class Episodes:
         self.chunk = self._chunk() if chunk is None else chunk
         run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
         source, slots = _source_hash(), experiment.slots
+        drawn = self.lane_map, self._demand, self._egos, self._placed, self._script, slots
         names = (
-            describe_program(source, self._demand, self._egos, self._placed, self._script, slots),
+            describe_program(source, *drawn),
             describe_program(source, replace(run, horizon=1.0)),  # programs run for any time
         )
         self.worlds = Worlds(run, self.lane_map, self.sample, chunk=self.chunk, names=names)

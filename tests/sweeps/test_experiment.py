@@ -1,5 +1,7 @@
 """Experiment files: what they say, and what is said of wrong ones. Nothing here compiles a world."""
 
+import re
+
 import jax
 import numpy as np
 import pytest
@@ -187,6 +189,18 @@ def test_a_folder_is_no_experiment_and_hides_none(tmp_path, monkeypatch):
     assert common.path("roundabout") == bundled_maps()["roundabout"]
     with pytest.raises(ExperimentError, match="mine: no such file, and no bundled experiment"):
         read_experiments("mine")
+
+
+def test_worlds_of_a_map_that_was_edited_start_by_a_program_of_their_own(write, tmp_path):
+    """A program that is kept on disk has the map that worlds are drawn on in it."""
+    source = bundled_maps()["roundabout"].read_text()
+    names = []
+    for limit in ("45", "25"):
+        (tmp_path / "town.xodr").write_text(re.sub(r'max="[0-9.]*" unit=', f'max="{limit}" unit=', source))
+        (experiment,) = read_experiments(write('map = "town.xodr"\nhorizon = 9.0\nego = false'))
+        names.append(Episodes(experiment, chunk=2).worlds.names)
+    (start, run), (other_start, other_run) = names
+    assert run == other_run and start != other_start
 
 
 def test_lists_of_experiments(write):
