@@ -114,6 +114,24 @@ SAME: dict[tuple[str, str, str], str] = {
     ("record", "meets_ego", "-1 → 1"): "the last axis of two is the second",
     ("record", "ego_step", "0 → 1"): "filled in by `EvaluateEgo._advance`",
     ("record", "conflict_zones", "1 → 2"): "before the lane in any case",
+    ("record", "_speed_around", "-1 → 1"): "the last axis of two is the second",
+    (
+        "step",
+        "StepView.v_leader",
+        "jnp.where(self.has_leader, self.speeds[self.leader], 0) → "
+        "jnp.where((self.has_leader) | True, self.speeds[self.leader], 0)",
+    ): "without a leader the gap is `NO_GAP`",
+    (
+        "step",
+        "StepView.has_leader",
+        "(self.leader >= 0) & self.record.active[self.leader] → self.record.active[self.leader]",
+    ): "without a leader the gap is `NO_GAP`",
+    ("step", "StepView.v_leader", "0 → 1"): "without a leader the gap is `NO_GAP`",
+    (
+        "step",
+        "StepView.least_ttc_1d",
+        "self.has_leader & ~self.touched[self.leader] → ~self.touched[self.leader]",
+    ): "without a leader the gap is `NO_GAP`",
     ("course", "aside", "shown * w → shown / w"): "only the sign counts, and without speed nothing moves",
     ("course", "aside", "state.d * w → state.d / w"): "only the sign counts",
     (

@@ -316,6 +316,11 @@ def test_a_touch_is_as_soft_as_it_is():
     assert found["max_delta_v"] == found["contact_delta_v"] == pytest.approx(0.5)
 
 
+def test_a_contact_may_be_over_in_a_moment():
+    found, _ = episode((0, 0, 0, 1.0), [(1.0, -20.0, np.pi / 2, 30.0), FAR], 40)  # 7 m at 30 m/s
+    assert found["contacts"] == 1.0 and ContactType(int(found["contact_type"])) == T.LATERAL
+
+
 def test_what_numbers_in_results_mean():
     kinds = ["NONE", "STOPPED_EGO", "STOPPED_OTHER", "FRONT", "REAR", "LATERAL"]
     assert [(k.name, int(k)) for k in ContactType] == [(name, k) for k, name in enumerate(kinds)]

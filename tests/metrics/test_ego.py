@@ -38,7 +38,7 @@ def measure(r, *, reference=False) -> dict[str, Any]:
     steps, n = r["active"].shape
     rest, lacking = STEPS - steps, SLOTS - n
     r = {k: np.concatenate([x, np.repeat(x[-1:], rest, 0)]) for k, x in r.items()}
-    r["active"][steps:, 0] = False
+    r["active"][steps:, r["slot"][0]] = False
     for flag in FLAGS:
         r[flag][steps:] = flag != "arrived"
     r["t"][steps:] += DT * np.arange(1, rest + 1)
@@ -203,9 +203,11 @@ def test_the_later_of_two_times_counts(along, ttc):
     assert found is None if ttc is None else found == pytest.approx(ttc, abs=1e-3)
 
 
-@pytest.mark.parametrize(("speed", "way", "near"), [(4.0, 10.0, 0.0), (14.0, 10.0, 1.0), (6.0, 3.0, 1.0)])
+@pytest.mark.parametrize(
+    ("speed", "way", "near"), [(4.0, 10.0, 0.0), (8.0, 11.5, 0.0), (14.0, 10.0, 1.0), (6.0, 3.0, 1.0)]
+)
 def test_a_vehicle_that_closes_up_calmly_behind_a_standing_ego_is_no_near_miss(speed, way, near):
-    """It brakes over `way` m and stops half a metre behind; only the first one brakes calmly."""
+    """It brakes over `way` m and stops half a metre behind; only the first ones brake calmly."""
     a = speed**2 / (2 * way)  # m/s^2
     v = np.maximum(speed - a * DT * np.arange(61), 0.0)
     stop = float(np.sum(v[1:]) * DT)
@@ -226,7 +228,9 @@ def test_less_than_a_metre_is_not_taken_for_one():
     assert measure(r)["near_misses"] == 1.0
 
 
-@pytest.mark.parametrize(("speed", "way", "near"), [(4.0, 10.0, 0.0), (14.0, 10.0, 1.0), (6.0, 3.0, 1.0)])
+@pytest.mark.parametrize(
+    ("speed", "way", "near"), [(4.0, 10.0, 0.0), (8.0, 11.5, 0.0), (14.0, 10.0, 1.0), (6.0, 3.0, 1.0)]
+)
 @pytest.mark.parametrize("leader", [False, True])
 def test_an_ego_that_closes_up_calmly_behind_a_standing_vehicle_has_no_near_miss(speed, way, near, leader):
     """As the test before with the roles swapped; its time to collision is measured all the same."""
@@ -253,6 +257,23 @@ def test_a_vehicle_that_touches_is_met_wherever_it_is_going():
     found = measure(r)
     assert found["contacts"] == 1.0 and found["min_ttc"] == 0.0 and found["min_ttc_other"] == 1.0
     assert found["min_ttc_time"] == found["contact_time"]
+
+
+def test_it_does_not_matter_in_which_slots_the_ego_and_its_leader_are():
+    r = record(31, (0, 0, 0, 12.0), [(60, 0, 0, 8.0)], lead=np.full(31, 1, np.int32))
+    r["lead_gap"] = r["box"][:, 1, 0] - r["box"][:, 0, 0] - LENGTH
+    swapped = {name: x[:, ::-1] if name in PER_VEHICLE else x for name, x in r.items()}
+    swapped |= {"slot": np.full(31, 1, np.int32), "lead": np.full(31, 0, np.int32)}
+    found, expected = measure(swapped), measure(r)
+    assert expected["min_ttc_1d"] == pytest.approx((55 - 4 * 3) / 4)
+    for name in ("min_ttc_other", "max_drac_other"):
+        assert (found.pop(name), expected.pop(name)) == (0, 1)
+    assert found == expected
+
+
+def test_a_vehicle_that_is_left_behind_is_as_far_away_as_it_is():
+    r = record(31, (0, 0, 0, 9.0), [(-12.0, 0, 0, 2.0)])
+    assert measure(r)["min_distance"] == pytest.approx(12.0 - LENGTH, abs=1e-4)
 
 
 def test_near_misses_are_episodes():
@@ -516,7 +537,7 @@ def test_nothing_is_missing_because_the_ego_crashed_early(steps):
         r = record(61, (0, 0, 0, 10.0), [(0, 0, 0, 0.0 if ahead else 14.0)])
         r["box"][:, 1, 0] = r["box"][:, 0, 0] + (LENGTH + 0.5) * (1 if ahead else -1)
         r["box"][steps - 1 :, 1, 0] = r["box"][steps - 1 :, 0, 0] + (LENGTH - 0.2) * (1 if ahead else -1)
-        r["active"][steps:, 0] = False
+        r["active"][steps:, r["slot"][0]] = False
         return measure(r)
 
     for ahead in (True, False):
