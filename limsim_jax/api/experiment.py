@@ -25,6 +25,7 @@ from limsim_jax.sweeps.experiment import (
     first_fault,
     read_experiments,
 )
+from limsim_jax.sweeps.sumo_files import resolved
 
 if TYPE_CHECKING:
     from limsim_jax.api.world import World
@@ -72,17 +73,18 @@ class Zone(_Named, ZoneTable):
 
 
 class Experiment:
-    """An experiment: a bundled one, a TOML file, or one that is built from keywords.
+    """An experiment: a bundled one, a TOML file, a `.sumocfg`, or one that is built from keywords.
 
         lj.Experiment("roundabout")
         lj.Experiment("mine.toml", horizon=60, policy=lj.PDMClosed())
         lj.Experiment(map="Town05.xodr", horizon=300, flows=[lj.Flow(rate=400)], ego=None)
+        lj.Experiment("morning.sumocfg")
 
     Keywords replace fields of the file. Every field is checked at once; nothing is compiled before it runs.
 
     Args:
-      source: name of a bundled experiment or a TOML file; None: keywords only, of which `map` and `horizon`
-        are needed.
+      source: name of a bundled experiment, a TOML file or a `.sumocfg`; None: keywords only, of which `map`
+        and `horizon` are needed.
       map: a `Map`, the name of a bundled map, or a map file.
       name: of letters, digits, `_` and `-`; by default that of the file or the map.
       horizon: s.
@@ -94,6 +96,8 @@ class Experiment:
       obstacles: `Obstacle`s on the road.
       zones: `Zone`s with closed lanes, other limits or friction.
       density: instead of that, vehicles per km of lane at the start.
+      demand: vehicles of SUMO instead of all these: a `.sumocfg`, or files of routes, trips and flows.
+      begin: time of SUMO's files at which the episode starts, s.
       mix: shares of vehicle classes.
       drivers: a `Population`, or the file of one.
       model: car-following model: "acc", "iidm", "idm", or a value such as `IDM()`.
@@ -126,6 +130,8 @@ class Experiment:
         obstacles: Sequence[ObstacleTable] | None = None,
         zones: Sequence[ZoneTable] | None = None,
         density: float | None = None,
+        demand: str | Path | Sequence[str | Path] | None = None,
+        begin: float | None = None,
         mix: Mapping[str, float] | None = None,
         drivers: Population | str | Path | None = None,
         model: CarFollowing | str | None = None,
@@ -149,6 +155,7 @@ class Experiment:
         traffic = {
             "flow": None if flows is None else list(flows), "vehicles": vehicles, "density": _number(density),
             "mix": None if mix is None else {k: float(x) for k, x in mix.items()},
+            "demand": None if demand is None else _paths(demand), "begin": _number(begin),
             "lane_changes": lane_changes, "after_collision": after_collision,
             "drivers": str(drivers) if isinstance(drivers, str | Path) else None,
             "model": model if isinstance(model, str) else None,
@@ -173,6 +180,7 @@ class Experiment:
             table["map"] = self._town.source if self._town.name not in bundled_maps() else self._town.name
         elif isinstance(map, str | Path):
             table["map"] = str(map)
+        table = _seen(table)
         if "name" not in table and "map" in table:
             table["name"] = "".join(c if c.isalnum() or c in "_-" else "_" for c in Path(table["map"]).stem)
         self.file = _checked(table)
@@ -298,6 +306,18 @@ def _checked(table: Mapping[str, Any]) -> ExperimentFile:
         return ExperimentFile.model_validate(table)
     except ValidationError as error:
         raise ExperimentError(f"{table.get('name', 'Experiment')}: {first_fault(error)}") from None
+
+
+def _paths(files: str | Path | Sequence[str | Path]) -> list[str]:
+    return [str(file) for file in ([files] if isinstance(files, str | Path) else files)]
+
+
+def _seen(table: dict[str, Any]) -> dict[str, Any]:
+    """The fields with a demand seen from here."""
+    try:
+        return resolved(table, Path())
+    except MapError as error:
+        raise ExperimentError(f"{table.get('name', 'Experiment')}: traffic.demand: {error}") from None
 
 
 def _number(x: float | None) -> float | None:

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 ExperimentArgument = Annotated[
     str,
-    typer.Argument(metavar="EXPERIMENT", help="Experiment file (.toml), or the name of a bundled one."),
+    typer.Argument(
+        metavar="EXPERIMENT", help="Experiment file (.toml or .sumocfg), or the name of a bundled one."
+    ),
 ]
 ResultsArgument = Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder that a sweep has written.")]
 ScenarioOption = Annotated[

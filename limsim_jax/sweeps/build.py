@@ -25,6 +25,7 @@ from limsim_jax.policies.several import Several
 from limsim_jax.policies.view import view_of
 from limsim_jax.sweeps.experiment import EgoTable, ExperimentError, ExperimentFile
 from limsim_jax.sweeps.places import placed, vehicles_of
+from limsim_jax.sweeps.sumo import town_of
 from limsim_jax.traffic import car_following
 from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand
 from limsim_jax.traffic.engine import Traffic
@@ -112,7 +113,8 @@ def map_of(experiment: ExperimentFile, town: Map | None = None) -> Map:
     """The map, with lanes and routes that are named as goals."""
     if town is None:
         try:
-            town = load_map(bundled_maps().get(experiment.map, experiment.map))
+            named = bundled_maps().get(experiment.map, experiment.map)
+            town = town_of(experiment) or load_map(named)
         except MapError as error:
             known = ", ".join(bundled_maps())
             hint = "" if os.path.exists(experiment.map) else f"; bundled maps are {known}"

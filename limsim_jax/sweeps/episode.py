@@ -54,8 +54,10 @@ from limsim_jax.sweeps.places import check_routes
 from limsim_jax.sweeps.reruns import CanBrake, Replay, Reruns
 from limsim_jax.sweeps.script import script_of, script_vehicles, share_done, with_zones
 from limsim_jax.sweeps.store import Outcome
+from limsim_jax.sweeps.sumo import files_of, sumo_of
 from limsim_jax.traffic.car_following import CarFollowing
 from limsim_jax.traffic.demand import Flow, sample_scenario
+from limsim_jax.traffic.demand.sumo import with_schedule
 from limsim_jax.traffic.ego import with_rows
 from limsim_jax.traffic.vehicles import Population
 from limsim_jax.types import Config, Scenario, State
@@ -121,7 +123,10 @@ class Episodes:
         self.units = self._units()
         self._check_success()
         self._demand = demand_of(experiment, self.town, self._egos, drivers, self._placed)
-        for doubt in doubts(experiment, self.town):
+        self._sumo = sumo_of(experiment, self.town)
+        notes = [] if self._sumo is None else self._sumo.notes
+        notes = [f"{experiment.name}: traffic.demand: {note}" for note in notes]
+        for doubt in [*doubts(experiment, self.town), *notes]:
             warnings.warn(doubt, stacklevel=2)
         self._check_room()
         config = Config(dt=experiment.dt, decision_every=experiment.decision_every)
@@ -133,9 +138,10 @@ class Episodes:
         self.chunk = self._chunk() if chunk is None else chunk
         run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
         source, slots = _source_hash(), experiment.slots
-        drawn = self.lane_map, self._demand, self._egos, self._placed, self._script, slots
+        sumo = None if self._sumo is None else self._sumo.tables
+        drawn = self.lane_map, self._demand, sumo, self._egos, self._placed, self._script, slots
         names = (
-            describe_program(source, *drawn),
+            None if self._by_chance else describe_program(source, *drawn),
             describe_program(source, replace(run, horizon=1.0)),  # programs run for any time
         )
         self.worlds = Worlds(run, self.lane_map, self.sample, chunk=self.chunk, names=names)
@@ -164,7 +170,12 @@ class Episodes:
     @property
     def lane_map(self) -> LaneMap:
         """The map on the device."""
-        return self.town.lanes
+        return self.town.lanes if self._sumo is None else self._sumo.lane_map
+
+    @property
+    def _by_chance(self) -> bool:
+        """Whether departures are drawn on the host: such a program cannot be kept on disk."""
+        return self._sumo is not None and self._sumo.random
 
     def under(self, policy: PolicyLike) -> Episodes:
         """The same worlds under another policy."""
@@ -217,6 +228,8 @@ class Episodes:
             one = self.egos == 1
             starts = "a random start needs" if one else f"{self.egos} random starts need"
             needed = "one vehicle" if one else f"{self.egos} vehicles"
+            if self._sumo is not None:
+                self._refuse("ego.start", f"{starts} a vehicle at the start, and a demand has none")
             self._refuse("traffic.density", f"{starts} at least {needed} at the start")
 
     def _check_views(self, config: Config) -> None:
@@ -249,10 +262,11 @@ class Episodes:
 
     def sample(self, key: jax.Array) -> Scenario:
         """The scenario of a world."""
-        return sample_scenario(
+        world = sample_scenario(
             self._demand, self.lane_map, key, self.experiment.slots, self._egos,
             vehicles=self._placed, script=self._script,
         )  # fmt: skip
+        return world if self._sumo is None else with_schedule(world, self._sumo.schedule(key))
 
     def _memory(self) -> int:
         """Bytes that one more world needs: its arrays at the start, and temporaries in proportion."""
@@ -275,8 +289,10 @@ class Episodes:
         """Where the rows come from."""
         device = jax.local_devices()[0]
         drivers, policy = self.experiment.traffic.drivers, self._values["policy"]
+        demand = files_of(self.experiment)
         return {
             **({"drivers": file_hash(Path(drivers).read_bytes())} if drivers is not None else {}),
+            **({"demand": {path.name: file_hash(path.read_bytes()) for path in demand}} if demand else {}),
             **{name: describe(value) for name, value in self._values.items() if value and name != "policy"},
             **({"policy": without_sources(describe(policy))} if policy is not None else {}),
             **({"policy_code": self._code} if self._code else {}),

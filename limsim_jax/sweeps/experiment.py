@@ -21,6 +21,7 @@ from pydantic import (
     model_validator,
 )
 
+from limsim_jax.maps.network import MapError
 from limsim_jax.policies.view import view_of
 from limsim_jax.sweeps.script_file import (
     ActionTable,
@@ -33,6 +34,7 @@ from limsim_jax.sweeps.script_file import (
     ZoneTable,
     one_or_more,
 )
+from limsim_jax.sweeps.sumo_files import CONFIG, resolved
 from limsim_jax.traffic.collision import AfterCollision
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=60)]
@@ -48,6 +50,10 @@ NO_POLICY = "traffic"
 
 class ExperimentError(ValueError):
     """An experiment cannot be run as it stands; one line that names file and field."""
+
+
+def _names(found: Any) -> Any:
+    return [found] if isinstance(found, str) else found
 
 
 class FlowTable(Table):
@@ -79,6 +85,12 @@ class TrafficTable(Table):
     density: NotNegative = 0.0
     """Instead of that, vehicles per km of lane at the start."""
     flow: Annotated[list[FlowTable], BeforeValidator(one_or_more)] = Field(default_factory=list)
+    demand: Annotated[list[str], BeforeValidator(_names)] = Field(default_factory=list)
+    """Vehicles of SUMO instead of all that: a `.sumocfg`, or files of routes, trips and flows, seen from the
+    experiment file."""
+    begin: NotNegative | None = None
+    """Time of SUMO's files at which the episode starts, s; absent: as the `.sumocfg` says, or the first
+    departure."""
     mix: dict[str, NotNegative] | None = None
     """Shares of vehicle classes."""
     drivers: str | None = None
@@ -91,6 +103,15 @@ class TrafficTable(Table):
     def _one_number(self) -> TrafficTable:
         if self.vehicles is not None and self.density:
             raise ValueError("vehicles or density, not both")
+        return self
+
+    @model_validator(mode="after")
+    def _one_source(self) -> TrafficTable:
+        others = "vehicles", "density", "flow", "mix", "drivers"
+        if self.demand and (given := [name for name in others if getattr(self, name)]):
+            raise ValueError(f"demand brings vehicles and drivers of its own; leave {', '.join(given)} out")
+        if self.begin is not None and not self.demand:
+            raise ValueError("begin is a time of SUMO's files; there is no demand")
         return self
 
 
@@ -215,6 +236,8 @@ def read_experiments(
                 f"{path}: no such file, and no bundled experiment either; bundled are {', '.join(known)}"
             )
         path = known[path.stem]
+    if path.suffix == CONFIG:
+        return [_of_sumo(path, map_file, policy)]
     try:
         found = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -242,6 +265,15 @@ def read_experiments(
     return [_experiment(found, path, map_file, policy)]
 
 
+def _of_sumo(path: Path, map_file: str | None, policy: str | None) -> ExperimentFile:
+    from limsim_jax.sweeps.sumo import experiment_of
+
+    try:
+        return _experiment(experiment_of(path), path, map_file, policy)
+    except MapError as error:
+        raise ExperimentError(str(error)) from None
+
+
 def _experiment(
     found: Mapping[str, Any], path: Path, map_file: str | None, policy: str | None
 ) -> ExperimentFile:
@@ -250,6 +282,10 @@ def _experiment(
         found["map"] = map_file
     elif isinstance(found.get("map"), str) and (path.parent / found["map"]).exists():
         found["map"] = str(path.parent / found["map"])
+    try:
+        found = resolved(found, path.parent)
+    except MapError as error:
+        raise ExperimentError(f"{path}: traffic.demand: {error}") from None
     traffic = found.get("traffic")
     if isinstance(traffic, dict) and isinstance(traffic.get("drivers"), str):
         drivers = path.parent / traffic["drivers"]

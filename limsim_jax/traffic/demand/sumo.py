@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Key
 from numpy.typing import NDArray
 
 from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, LaneMap, bucket, lane_rows
 from limsim_jax.maps.network import Lane, MapError, Network
 from limsim_jax.maps.route_table import RouteTable
 from limsim_jax.maps.routing import build_fixed_routes, build_routes
-from limsim_jax.maps.sumo.records import Demand, Flow, Vehicle, VehicleType
+from limsim_jax.maps.signal_table import SignalTable
+from limsim_jax.maps.sumo.records import Demand, Distribution, Flow, Vehicle, VehicleType
 from limsim_jax.traffic.demand.arrays import LEAST_ORIGINS, LEAST_ROWS, NEVER
 from limsim_jax.traffic.demand.sample import departure_place, entry_speed, typical_vehicles
 from limsim_jax.traffic.state import start_state
-from limsim_jax.traffic.vehicles import from_vtypes, sample_vehicles
+from limsim_jax.traffic.vehicles import Population, from_vtypes, sample_vehicles
 from limsim_jax.types import Queues, Scenario, Schedule
+
+FEW = 8.0
+"""Standard deviations by which a random flow may exceed its mean before its last vehicles have no room."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,30 +74,188 @@ def sumo_scenario(
       ValueError: no vehicle departs.
     """
     notes = _Notes()
-    departures = _departures(demand, end, np.random.default_rng([seed, 0]), notes)
-    first = min((d.time for d in departures), default=0.0)
-    begin = math.floor(first) if begin is None else begin
-    early = [d for d in departures if d.time < begin]
-    notes.add("departs before the scenario begins; left out", [d.id for d in early])
-    departures = [d for d in departures if d.time >= begin]
-    departures = _with_types(demand, departures, np.random.default_rng([seed, 1]), notes)
+    if begin is None:
+        departures = _departures(demand, end, np.random.default_rng([seed, 0]), _Notes())
+        begin = math.floor(min((d.time for d in departures), default=0.0))
     ways = _Ways(network, lane_map)
-    placed = _place(network, ways, demand, departures, np.random.default_rng([seed, 2]), notes)
+    placed = _drawn(network, ways, demand, begin, end, [seed], notes)
     if not placed:
         raise ValueError("the demand has no vehicle that departs: " + "; ".join(notes.lines()))
     placed.sort(key=lambda d: (d.row, d.time))
-    signals = lane_map.signals  # whose time is that of the files
-    signals = replace(signals, offset=jnp.mod(signals.offset - begin, signals.cycle))
-    lane_map = replace(lane_map, routes=ways.table(), signals=signals)
+    lane_map = replace(lane_map, routes=ways.table(), signals=_signals_from(lane_map, begin))
     types = list(dict.fromkeys(d.type for d in placed))
-    scenario = _scenario(lane_map, demand, types, placed, begin, slots, seed)
+    lanes = sorted({d.row for d in placed})
+    rows = jax.tree.map(jnp.asarray, _rows(placed, lanes, types, begin, bucket(len(placed), LEAST_ROWS)))
+    population = from_vtypes([demand.types[name] for name in types])
+    schedule = jax.jit(_schedule)(lane_map, population, rows, jax.random.key(seed))
+    zero = jnp.zeros(slots, jnp.float32)
+    nowhere, nothing = jnp.full(slots, NO_LANE), jnp.zeros(slots, jnp.int32)
+    vehicles = typical_vehicles(population, slots)
+    state = start_state(lane_map, *vehicles, lane=nowhere, s=zero, v=zero, goal=nothing)
     return SumoScenario(
         lane_map=lane_map,
-        scenario=scenario,
+        scenario=with_schedule(Scenario(start=state, schedule=schedule), schedule),
         vehicles=tuple(d.id for d in placed),
         routes=tuple(ways.routes),
         notes=tuple(notes.lines()),
     )
+
+
+def with_schedule(world: Scenario, schedule: Schedule) -> Scenario:
+    """The world with other departures than it has; its script stays."""
+    queues = Queues(next=schedule.start[:-1], full=jnp.int32(0))
+    schedule = replace(schedule, script=world.schedule.script)
+    return Scenario(start=replace(world.start, queues=queues), schedule=schedule)
+
+
+def _signals_from(lane_map: LaneMap, begin: float) -> SignalTable:
+    """Signal programs, as they are when a scenario begins at this time."""
+    signals = lane_map.signals
+    return replace(signals, offset=jnp.mod(signals.offset - begin, signals.cycle))
+
+
+class SumoDemand:
+    """SUMO's demand on a map, from which worlds are drawn: what it leaves to chance differs by key.
+
+    Args:
+      network: the map.
+      lane_map: of that map. Its goals stay the first ones; the routes of the demand follow.
+      demand: from `maps.sumo.read_demand`.
+      seconds: for how long vehicles depart.
+      begin: time of the files at which worlds start, s; default: that of the first departure.
+
+    Raises:
+      MapError: a vehicle type that no file defines.
+      ValueError: no vehicle departs.
+    """
+
+    lane_map: LaneMap
+    """With the goals of the map and the routes of the demand as `routes`; signal programs start where they
+    are at `begin`."""
+    notes: tuple[str, ...]
+    """One line, with counts, per thing that is left out or done in another way than in SUMO."""
+
+    def __init__(
+        self,
+        network: Network,
+        lane_map: LaneMap,
+        demand: Demand,
+        *,
+        seconds: float,
+        begin: float | None = None,
+    ) -> None:
+        timed = [v.depart for v in demand.vehicles.values() if not isinstance(v.depart, str)]
+        first = min([*timed, *(flow.begin for flow in demand.flows.values())], default=0.0)
+        self.begin = math.floor(first) if begin is None else begin
+        self._end, self._network, self._demand = self.begin + seconds, network, demand
+        self._ways = _Ways(network, lane_map)
+        self._types = self._every_way()
+        departures = self._draw([0], notes := _Notes())
+        if not self._ways.columns or not (departures or _leaves_to_chance(demand)):
+            why = "; ".join(notes.lines()) or f"from {self.begin:g} to {self._end:g} s none is due"
+            raise ValueError(f"the demand has no vehicle that departs: {why}")
+        self.notes = tuple(notes.lines())
+        edges = {network.lanes[lane].road for lane in self._ways.starts}
+        self._lanes = sorted(
+            self._ways.rows[x.id] for edge in edges for x in network.road_lanes(edge) if x.drivable
+        )
+        self._size = bucket(self._most(len(departures)), LEAST_ROWS)
+        self._population = from_vtypes([demand.types[name] for name in self._types])
+        self.random = _leaves_to_chance(demand)
+        """Whether departures, types, routes or places are drawn; drivers always are."""
+        known = lane_map.routes.distance.shape[1]
+        self._first_goal = known
+        found = self._ways.table(lane_map.routes)
+        self.lane_map = replace(lane_map, routes=found, signals=_signals_from(lane_map, self.begin))
+        self._fixed = self._as_rows(departures)
+
+    @property
+    def tables(self) -> tuple[Any, Population]:
+        """What worlds are made of where only drivers are drawn."""
+        return self._fixed, self._population
+
+    def at_once(self) -> int:
+        """Vehicles on the road at once, at half the limits."""
+        rows, table = self._fixed, jax.tree.map(np.asarray, self.lane_map)
+        come = rows.lane != NO_LANE
+        lane, goal, time = rows.lane[come], rows.goal[come], rows.time[come]
+        limit = np.median([x.speed_limit for x in self._network.drivable_lanes()])
+        leave = time + table.routes.distance[lane, goal] / (0.5 * limit)
+        order = np.argsort([*time, *leave], kind="stable")
+        return int(np.max(np.cumsum(np.where(order < len(time), 1, -1)), initial=0))
+
+    def schedule(self, key: Key[Array, ""]) -> Schedule:
+        """The departures of a world."""
+        rows = self._fixed
+        if self.random:
+            shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), rows)
+            rows = jax.pure_callback(self._of_key, shapes, jax.random.key_data(key), vmap_method="sequential")
+        return _schedule(self.lane_map, self._population, jax.tree.map(jnp.asarray, rows), key)
+
+    def _of_key(self, words: Array) -> _Rows:
+        return self._as_rows(self._draw(np.asarray(words).tolist(), _Notes()))
+
+    def _as_rows(self, departures: list[_Departure]) -> _Rows:
+        rows = _rows(departures, self._lanes, self._types, self.begin, self._size)
+        return rows._replace(
+            goal=np.where(rows.lane != NO_LANE, rows.goal + self._first_goal, 0).astype(np.int32)
+        )
+
+    def _draw(self, seed: list[int], notes: _Notes) -> list[_Departure]:
+        """What departs in one world, placed."""
+        return _drawn(self._network, self._ways, self._demand, self.begin, self._end, seed, notes)
+
+    def _every_way(self) -> list[str]:
+        """Find the ways of all types on all routes; return the types."""
+        demand, rng, found, types = self._demand, np.random.default_rng(0), [], {}
+        flows = [flow.vehicle for flow in demand.flows.values()]
+        for vehicle in [*demand.vehicles.values(), *flows]:
+            for name in _members(demand.type_distributions, vehicle.type):
+                kind = demand.types.get(name)
+                if kind is None or kind.engine_class is None:  # it is said where it is drawn
+                    continue
+                types[name] = None
+                for route in _members(demand.route_distributions, vehicle.route):
+                    edges = _edges(demand, replace(vehicle, route=route), rng)
+                    found.append(
+                        (_Departure(id=vehicle.id, number=0, time=0, vehicle=vehicle, type=name), edges)
+                    )
+        for departure, edges in sorted(found, key=lambda pair: -len(pair[1])):
+            if edges:
+                kind = demand.types[departure.type]
+                _way(self._network, self._ways, departure, edges, kind, {}, rng, _Notes())
+        return list(types)
+
+    def _most(self, drawn: int) -> int:
+        """Vehicles that depart in any world, at most."""
+        most = drawn
+        for flow in self._demand.flows.values():
+            rate = flow.probability or flow.poisson_rate
+            if rate:
+                until = min(self._end, math.inf if flow.end is None else flow.end)
+                mean = rate * max(until - max(flow.begin, self.begin), 0)
+                bound = mean + FEW * math.sqrt(mean) + FEW
+                most += math.ceil(min(bound, math.inf if flow.number is None else flow.number))
+        return most
+
+
+def _leaves_to_chance(demand: Demand) -> bool:
+    """Whether anything but the drivers differs from world to world."""
+    flows = demand.flows.values()
+    vehicles = [*demand.vehicles.values(), *(flow.vehicle for flow in flows)]
+    return any(flow.probability or flow.poisson_rate for flow in flows) or any(
+        "random" in (x.depart_lane, x.depart_pos, x.depart_speed)
+        or x.type in demand.type_distributions
+        or x.route in demand.route_distributions
+        for x in vehicles
+    )
+
+
+def _members(distributions: Mapping[str, Distribution], name: Any) -> list[Any]:
+    """What a name may stand for: itself, or the members of a distribution, and theirs."""
+    if name not in distributions:
+        return [name]
+    return [x for member in distributions[name].members for x in _members(distributions, member)]
 
 
 @dataclass
@@ -121,6 +285,24 @@ class _Departure:
     s: float | None = None  # m; None: where the lane starts
     v: float = math.inf  # m/s, wanted
     goal: int = -1
+
+
+def _drawn(
+    network: Network,
+    ways: _Ways,
+    demand: Demand,
+    begin: float,
+    end: float | None,
+    seed: Sequence[int],
+    notes: _Notes,
+) -> list[_Departure]:
+    """What departs from `begin` to `end`: type, lane, place, speed and goal."""
+    departures = _departures(demand, end, np.random.default_rng([*seed, 0]), notes)
+    early = [d for d in departures if d.time < begin]
+    notes.add("departs before the scenario begins; left out", [d.id for d in early])
+    departures = [d for d in departures if d.time >= begin]
+    departures = _with_types(demand, departures, np.random.default_rng([*seed, 1]), notes)
+    return _place(network, ways, demand, departures, np.random.default_rng([*seed, 2]), notes)
 
 
 def _departures(
@@ -215,6 +397,7 @@ class _Ways:
         self.routes: list[tuple[str, ...]] = []
         self.columns: list[RouteTable] = []
         self.known: dict[tuple[str | None, tuple[str, ...]], int] = {}
+        self.starts: set[str] = set()  # lanes on which vehicles depart
         # classes that may use the same lanes share columns
         groups: dict[tuple[bool, ...], str] = {}
         self.like = {
@@ -248,12 +431,12 @@ class _Ways:
         for i in range(1, len(edges) - 1):
             self.known.setdefault((group, edges[i:]), column)
 
-    def table(self) -> RouteTable:
-        """All columns, padded to the size of the lane map."""
-        whole = RouteTable(
-            **{name: np.hstack([vars(c)[name] for c in self.columns]) for name in vars(self.columns[0])}
-        )
-        padded = whole.pad(lanes=self.size, goals=bucket(len(self.columns), 16))
+    def table(self, first: RouteTable | None = None) -> RouteTable:
+        """All columns behind those of `first`, padded to the lane map."""
+        parts = [column.pad(lanes=self.size, goals=column.distance.shape[1]) for column in self.columns]
+        parts = parts if first is None else [first, *parts]
+        whole = RouteTable(**{name: np.hstack([vars(x)[name] for x in parts]) for name in vars(parts[0])})
+        padded = whole.pad(lanes=self.size, goals=bucket(whole.distance.shape[1], 16))
         return jax.tree.map(jnp.asarray, padded)
 
 
@@ -349,6 +532,7 @@ def _way(
         lane = _depart_lane(network, ways, departure, edges[0], goal, vehicle_class, usage, rng, notes)
         if lane is not None:
             notes.add(note, [departure.id] if note else [])
+            ways.starts.add(lane.id)
             return lane, goal
     notes.add("there is no way from its first edge to its last one; left out", [departure.id])
     return None, -1
@@ -413,51 +597,59 @@ def _depart_speed(departure: _Departure, lane: Lane, rng: np.random.Generator) -
     return math.inf if isinstance(wish, str) else wish
 
 
-def _scenario(
-    lane_map: LaneMap,
-    demand: Demand,
-    types: list[str],
-    placed: list[_Departure],
-    begin: float,
-    slots: int,
-    seed: int,
-) -> Scenario:
-    """A scenario of empty roads and departures, sorted by lane and time."""
-    lanes = sorted({d.row for d in placed})
-    rows, origins = bucket(len(placed), LEAST_ROWS), bucket(len(lanes), LEAST_ORIGINS)
+class _Rows(NamedTuple):
+    """Departures sorted by lane and time, arrays `[V]`; rows that are not used come never."""
 
-    def table(values: list[float], fill: float, dtype: type) -> NDArray[np.generic]:
+    time: Any  # s since the scenario begins
+    number: Any  # in the order of the files
+    type: Any  # row of the population
+    lane: Any
+    goal: Any
+    factor: Any  # on the speed limit; NaN: that of the driver
+    s: Any  # m; -1: as far back as the body fits
+    v: Any  # m/s, wanted
+    start: Any  # first row of each lane, and the end of the last
+
+
+def _rows(placed: list[_Departure], lanes: list[int], types: list[str], begin: float, rows: int) -> _Rows:
+    """Departures as arrays of `rows` rows, with a queue for each lane."""
+    placed = sorted(placed, key=lambda d: (d.row, d.time))
+    if len(placed) > rows:  # never, but for draws beyond `FEW` in a row
+        latest = sorted(placed, key=lambda d: d.time)[rows:]
+        placed = [d for d in placed if d not in latest]
+
+    def table(values: list[float], fill: float, dtype: type) -> NDArray[Any]:
         return np.array(values + [fill] * (rows - len(values)), dtype)
 
     start = np.searchsorted([d.row for d in placed], lanes).tolist()
-    start += [len(placed)] * (origins + 1 - len(lanes))
-    population = from_vtypes([demand.types[name] for name in types])
-    number = jnp.asarray(table([d.number for d in placed], 0, np.int32))
-    of_type = jnp.asarray(table([types.index(d.type) for d in placed], 0, np.int32))
-    lane = jnp.asarray(table([d.row for d in placed], NO_LANE, np.int32))
-    goal = jnp.asarray(table([d.goal for d in placed], 0, np.int32))
-    factor = table([d.vehicle.speed_factor or math.nan for d in placed], math.nan, np.float32)
-    at = jnp.asarray(table([-1.0 if d.s is None else d.s for d in placed], -1.0, np.float32))
-    wanted = jnp.asarray(table([min(d.v, NEVER) for d in placed], 0.0, np.float32))
+    start += [len(placed)] * (bucket(len(lanes), LEAST_ORIGINS) + 1 - len(lanes))
+    return _Rows(
+        time=table([d.time - begin for d in placed], NEVER, np.float32),
+        number=table([d.number for d in placed], 0, np.int32),
+        type=table([types.index(d.type) for d in placed], 0, np.int32),
+        lane=table([d.row for d in placed], NO_LANE, np.int32),
+        goal=table([d.goal for d in placed], 0, np.int32),
+        factor=table([d.vehicle.speed_factor or math.nan for d in placed], math.nan, np.float32),
+        s=table([-1.0 if d.s is None else d.s for d in placed], -1.0, np.float32),
+        v=table([min(d.v, NEVER) for d in placed], 0.0, np.float32),
+        start=np.array(start, np.int32),
+    )
 
-    driver, shape = jax.jit(sample_vehicles)(population, jax.random.key(seed), number, of_type)
-    own = jnp.where(jnp.isnan(factor), driver.speed_factor, factor)
+
+def _schedule(lane_map: LaneMap, population: Population, rows: _Rows, key: Key[Array, ""]) -> Schedule:
+    """A schedule of departures; the key draws drivers and bodies."""
+    driver, shape = sample_vehicles(population, key, rows.number, rows.type)
+    own = jnp.where(jnp.isnan(rows.factor), driver.speed_factor, rows.factor)
     driver = replace(driver, speed_factor=own)
-    base = departure_place(lane_map, lane, shape.length)
-    s = jnp.clip(at, base, jnp.maximum(base, lane_map.length[lane] - 0.5))
-    schedule = Schedule(
-        time=jnp.asarray(table([d.time - begin for d in placed], NEVER, np.float32)),
-        lane=lane,
+    base = departure_place(lane_map, rows.lane, shape.length)
+    s = jnp.clip(rows.s, base, jnp.maximum(base, lane_map.length[rows.lane] - 0.5))
+    return Schedule(
+        time=rows.time,
+        lane=rows.lane,
         s=s,
-        v=jnp.minimum(wanted, entry_speed(lane_map, driver, lane, s, goal)),
-        goal=goal,
+        v=jnp.minimum(rows.v, entry_speed(lane_map, driver, rows.lane, s, rows.goal)),
+        goal=rows.goal,
         driver=driver,
         shape=shape,
-        start=jnp.asarray(start, jnp.int32),
+        start=rows.start,
     )
-    zero = jnp.zeros(slots, jnp.float32)
-    nowhere, nothing = jnp.full(slots, NO_LANE), jnp.zeros(slots, jnp.int32)
-    vehicles = typical_vehicles(population, slots)
-    state = start_state(lane_map, *vehicles, lane=nowhere, s=zero, v=zero, goal=nothing)
-    queues = Queues(next=schedule.start[:-1], full=jnp.int32(0))
-    return Scenario(start=replace(state, queues=queues), schedule=schedule)
