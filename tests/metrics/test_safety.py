@@ -88,6 +88,23 @@ def test_ttc_2d_is_what_time_stepping_finds():
     assert hits > 25
 
 
+def test_each_side_alone_can_keep_boxes_apart():
+    n, rng = 2000, np.random.default_rng(5)
+    a, b = (
+        np.concatenate([rng.uniform(-2, 2, (n, 3)) * [1, 1, np.pi / 2], rng.uniform(1, 4, (n, 2))], -1)
+        for _ in "ab"
+    )
+    found = np.asarray(overlaps(pairs(*map(f, (a, np.zeros((n, 2)), b, np.zeros((n, 2)))))))
+    apart = np.zeros((n, 4), bool)
+    for k in range(n):
+        for i, heading in enumerate((a[k, 2], a[k, 2] + np.pi / 2, b[k, 2], b[k, 2] + np.pi / 2)):
+            mine, other = (corners(x) @ [np.cos(heading), np.sin(heading)] for x in (a[k], b[k]))
+            apart[k, i] = mine.max() < other.min() or other.max() < mine.min()
+    np.testing.assert_array_equal(found, ~apart.any(1))
+    alone = apart & (apart.sum(1) == 1)[:, None]
+    assert (alone.sum(0) > 20).all()
+
+
 def test_distance_is_that_of_the_polygons():
     n = 300
     a, b, va, vb = random_pairs(n, 1)
