@@ -70,6 +70,8 @@ TESTS = {
 
 GUARD = "guards a division whose result is not used"
 MEMORY = "changes the memory only"
+UNSEEN = "before the first step nobody was in any zone"
+LATER = "later steps inside give no shorter times"
 SAME: dict[tuple[str, str, str], str] = {
     ("safety", "", "1000000.0 → 3600000.0"): "stands for infinity",
     ("safety", "", "1000.0 → 3600.0"): "stands for infinity",
@@ -80,7 +82,23 @@ SAME: dict[tuple[str, str, str], str] = {
         "time_headway",
         "(v > 0) & (gap < NO_GAP) → gap < NO_GAP",
     ): "a division by 0 is capped as well",
+    ("safety", "", "0.0001 → 0.00036"): "bodies that move by centimetres until `FORESIGHT`",
+    ("safety", "contact_interval", "1e-09 → 3.6000000000000004e-09"): "stands for nothing",
+    ("safety", "ttc_1d", "jnp.where(found, closing, 1) → jnp.where((found) | True, closing, 1)"): GUARD,
+    ("safety", "time_headway", "jnp.where(found, v, 1) → jnp.where((found) | True, v, 1)"): GUARD,
+    ("safety", "pet_init", "-NONE → NONE"): UNSEEN,
+    ("safety", "pet_init", "-1 → 1"): UNSEEN,
     ("safety", "pet_init", "1 → 2"): "no zone has this number either",
+    (
+        "safety",
+        "pet_update",
+        "(zones.id[:, None] == carry.id[None, :]) & exists[:, None] → zones.id[:, None] == carry.id[None, :]",
+    ): "a zone that is not there has no past",
+    ("safety", "pet_update", "zones.ego & exists → zones.ego"): "a zone that is not there has no past",
+    ("safety", "pet_update", "other_was & ~other_in → other_was"): "inside, the contact of both comes first",
+    ("safety", "pet_update", "ego_in & ~ego_was → ego_in"): LATER,
+    ("safety", "pet_update", "other_in & ~other_was → other_in"): LATER,
+    ("safety", "pet_update", "ego_in & other_in & (ego_enters | other_enters) → ego_in & other_in"): LATER,
     ("safety", "pet_update", "zones.other & exists → zones.other"): "a zone that is not there has no past",
     ("safety", "pet_update", "ego_was & ~ego_in → ego_was"): "inside, the contact of both comes first",
     ("motion", "stream.inner", "1e-09 → 3.6000000000000004e-09"): "tolerance of rounding",

@@ -165,6 +165,12 @@ def test_a_contact_has_an_end():
     assert float(cease) == pytest.approx(1.675, rel=1e-5)
 
 
+def test_contacts_of_now_and_of_the_past_have_a_beginning():
+    for x, expected in ((3.0, (-0.1, 0.4)), (-10.0, (-0.75, -0.25))):  # 5 m long, 20 m/s
+        e = pair(EGO, (20.0, 0.0), (x, 0.0, 0.0, 5.0, 2.0), (0.0, 0.0))
+        assert [float(t) for t in contact_interval(e)] == pytest.approx(expected, rel=1e-5)
+
+
 def test_rounding_of_a_speed_that_is_zero_changes_nothing():
     # Compilers compute a speed twice, with different errors: the begin may see one, the end the other.
     beside = (20.0, 6.0, 0.0, 5.0, 2.0), (10.0, 0.0)
@@ -308,6 +314,7 @@ def one_zone(ego, other, n=40):
         ((30, 33), (8, 12), 1.8, 3.0),  # other first
         ((5, 10), (10, 12), 0.0, 1.0),  # one out, other in
         ((5, 10), (8, 12), 0.0, 0.8),  # together
+        ((8, 12), (5, 10), 0.0, 0.8),
         ((5, 10), (5, 12), 0.0, 0.5),  # in at the same step
         ((5, 10), (90, 91), None, None),  # no other vehicle
         ((90, 91), (5, 10), None, None),
