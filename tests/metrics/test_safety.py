@@ -331,6 +331,8 @@ def test_pet_by_hand(ego, other, expected, when):
 def test_pet_counts_the_last_who_left_and_the_least_of_all_zones():
     first, second = one_zone((20, 25), (2, 6)), one_zone((30, 33), (5, 28))
     assert float(pet([[a[0], b[0]] for a, b in zip(first, second, strict=True)]).value) == pytest.approx(0.2)
+    met, alone = one_zone((5, 10), (22, 25)), one_zone((15, 20), (90, 91))
+    assert float(pet([[a[0], b[0]] for a, b in zip(met, alone, strict=True)]).value) == pytest.approx(1.2)
     twice = one_zone((20, 25), (2, 6))
     for i in (14, 15, 16):
         twice[i] = [(False, True)]
