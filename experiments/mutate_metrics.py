@@ -166,6 +166,18 @@ SAME: dict[tuple[str, str, str], str] = {
     ("course", "course", "-1 → 1"): "the last axis of two is the second",
     ("course", "_ahead", "-1 → 1"): "the last axis of two is the second",
     ("course", "_ahead", "0 → 1"): "where there is no lane, nothing lies beyond",
+    (
+        "measures.rss",
+        "ResponsibilityDistances.update",
+        "step.has_leader & (step.gap < rss_longitudinal(step.v, step.v_leader, rss)) → "
+        "step.gap < rss_longitudinal(step.v, step.v_leader, rss)",
+    ): "without a leader the gap is `NO_GAP`",
+    (
+        "measures.rss",
+        "ResponsibilityDistances.update",
+        "unsafe & (since > rss.response + dt / 2) → since > rss.response + dt / 2",
+    ): "`since` is 0 where the distance is kept",
+    ("measures.rss", "ResponsibilityDistances.update", "2 → 3"): "tolerance of rounding",
     ("measures.rss", "ResponsibilityDistances.update", "0.01 → 0.036000000000000004"): (
         "tolerance of rounding"
     ),

@@ -276,6 +276,14 @@ def test_a_vehicle_that_is_left_behind_is_as_far_away_as_it_is():
     assert measure(r)["min_distance"] == pytest.approx(12.0 - LENGTH, abs=1e-4)
 
 
+@pytest.mark.parametrize(("v", "response"), [(0.0, False), (0.2, True)])
+def test_an_ego_that_stands_too_near_need_not_brake(v, response):
+    r = record(31, (0, 0, 0, v), [(LENGTH + 0.2, 0, 0, v)], lead=np.ones(31, np.int32))
+    found = measure(r | {"lead_gap": np.full(31, 0.2)})
+    assert found["rss_longitudinal"] == 1.0 and (found["rss_no_response"] > 0.5) == response
+    assert response or found["rss_no_response"] == 0.0
+
+
 def test_near_misses_are_episodes():
     """A crossing car, twice a short TTC in between a longer one; the second time it oscillates."""
     v = np.full(61, 10.0)
@@ -424,6 +432,10 @@ def test_against_the_flow():
     found = measure(free(lane_heading=heading))
     assert found["against_flow"] == pytest.approx(11.0, abs=1e-3)
     assert (found["wrong_way"], found["nuplan_driving_direction"]) == (1.0, 0.0)
+    assert measure(free(v=0.2, lane_heading=heading))["wrong_way"] == 1.0
+    # the record of the start is no step: 5 steps of 1 m
+    few = measure(free(6, lane_heading=np.full(6, np.pi)))["against_flow"]
+    assert few == pytest.approx(5.0, abs=1e-3)
     # a step off the lanes neither adds nor takes away
     gap = np.arange(61) == 23
     heading = np.where((np.arange(61) >= 20) & (np.arange(61) < 27), np.pi, 0.0)
