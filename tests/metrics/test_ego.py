@@ -386,6 +386,17 @@ def test_nuplans_ttc_looks_ahead_and_in_junctions_aside(y, changing, junction, k
     assert found["nuplan_ttc"] == kept
 
 
+@pytest.mark.parametrize(
+    ("v", "relevant", "kept"), [(0.01, True, 0.0), (0.01, False, 1.0), (9.0, False, 1.0)]
+)
+def test_nuplans_ttc_is_of_vehicles_that_may_meet_an_ego_that_moves(v, relevant, kept):
+    r = record(31, (0, 0, 0, v), [(11.0, 0, 0, 0.0)])
+    r["box"][:, 1, 0] = r["box"][:, 0, 0] + 11.0
+    r["velocity"][:, 1] = [v - 10.0, 0.0]
+    r["relevant"][:, 1] = relevant
+    assert measure(r)["nuplan_ttc"] == kept
+
+
 @pytest.mark.parametrize(("x", "v"), [(-11.0, 10.0), (11.0, 0.0)])
 def test_nuplans_ttc_does_not_ask_for_more_than_the_ego_can_do(x, v):
     """In a junction, a vehicle 0.6 s behind; and a standing ego with a vehicle that comes from ahead."""
