@@ -177,6 +177,11 @@ SAME: dict[tuple[str, str, str], str] = {
         "ResponsibilityDistances.update",
         "unsafe & (since > rss.response + dt / 2) → since > rss.response + dt / 2",
     ): "`since` is 0 where the distance is kept",
+    (
+        "measures.scores",
+        "LimSimScores.result",
+        "summary.started & summary.failed → summary.failed",
+    ): "what has not started has not failed",
     ("measures.rss", "ResponsibilityDistances.update", "2 → 3"): "tolerance of rounding",
     ("measures.rss", "ResponsibilityDistances.update", "0.01 → 0.036000000000000004"): (
         "tolerance of rounding"

@@ -532,6 +532,8 @@ def test_a_policy_that_breaks_is_a_failure_with_scores_of_0(step):
     assert found["duration"] == pytest.approx(step * DT, abs=1e-4)
     assert found["distance"] == pytest.approx((step - 1) * DT * 10, abs=1e-3)
     assert [found[name] for name in SCORES] == [0.0] * 4
+    if step > 20:
+        assert found["limsim_corrected_safety"] > 0 and found["limsim_faithful_comfort"] > 0
     fine = measure(free(61))
     assert (fine["policy_failed"], fine["policy_failed_time"]) == (0.0, None)
     if step > 1:  # otherwise no step is driven
@@ -572,6 +574,17 @@ def test_nothing_is_missing_because_the_ego_crashed_early(steps):
             assert early["worst_second"] == 0.0
             assert early["worst_second_time"] == pytest.approx(early["contact_time"], abs=1e-4)
         assert (early["nuplan_score"] == 0.0) == ahead
+
+
+def test_an_ego_that_arrives_within_its_first_second_has_no_second_to_judge():
+    found = measure(free(6, arrived=np.arange(6) == 5))
+    assert found["arrived"] == 1.0 and found["worst_second"] is found["limsim_corrected_total"] is None
+
+
+def test_the_worst_second_is_the_one_with_the_red_light():
+    found = measure(free(61, red_light=np.arange(61) == 15))
+    assert found["worst_second_time"] == pytest.approx(4.0, abs=1e-3)  # it begins 1 s after the start
+    assert found["worst_second"] < measure(free(61))["worst_second"]
 
 
 def test_carla_counts_no_contact_of_a_standing_ego_and_repeats_within_5_m_once():
