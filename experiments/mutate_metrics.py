@@ -179,7 +179,7 @@ SAME: dict[tuple[str, str, str], str] = {
     ): "`since` is 0 where the distance is kept",
     (
         "measures.scores",
-        "LimSimScores.result",
+        "LimSim.result",
         "summary.started & summary.failed → summary.failed",
     ): "what has not started has not failed",
     ("measures.rss", "ResponsibilityDistances.update", "2 → 3"): "tolerance of rounding",

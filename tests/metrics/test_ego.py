@@ -581,9 +581,10 @@ def test_an_ego_that_arrives_within_its_first_second_has_no_second_to_judge():
     assert found["arrived"] == 1.0 and found["worst_second"] is found["limsim_corrected_total"] is None
 
 
-def test_the_worst_second_is_the_one_with_the_red_light():
-    found = measure(free(61, red_light=np.arange(61) == 15))
-    assert found["worst_second_time"] == pytest.approx(4.0, abs=1e-3)  # it begins 1 s after the start
+def test_the_worst_second_is_the_one_in_which_the_ego_brakes():
+    v = 14.0 - 0.6 * np.clip(np.arange(61) - 21, 0, 8)  # 6 m/s^2 in the third second
+    found = measure(free(61, v=v))
+    assert found["worst_second_time"] == pytest.approx(6.0, abs=1e-3)
     assert found["worst_second"] < measure(free(61))["worst_second"]
 
 
