@@ -177,6 +177,23 @@ SAME: dict[tuple[str, str, str], str] = {
         "ResponsibilityDistances.update",
         "unsafe & (since > rss.response + dt / 2) → since > rss.response + dt / 2",
     ): "`since` is 0 where the distance is kept",
+    ("ego", "EgoMetrics.update", "carry.over | arrives → arrives"): "what is over is not there either",
+    (
+        "ego",
+        "EgoMetrics._summary",
+        "carry.started & ~carry.over → ~carry.over",
+    ): "an ego that has not started has no metrics",
+    ("ego", "EgoMetrics._summary", "1.0 → 3.6"): "is cut off at 1",
+    (
+        "ego",
+        "EgoMetrics._summary",
+        "carry.started & (duration > 0) → duration > 0",
+    ): "what has not started has lasted 0 s",
+    (
+        "ego",
+        "EgoMetrics._summary",
+        "carry.started & (failed | (duration > 0)) → failed | (duration > 0)",
+    ): "what has not started has lasted 0 s and not failed",
     (
         "measures.scores",
         "LimSim.result",

@@ -579,6 +579,21 @@ def test_nothing_is_missing_because_the_ego_crashed_early(steps):
 def test_an_ego_that_arrives_within_its_first_second_has_no_second_to_judge():
     found = measure(free(6, arrived=np.arange(6) == 5))
     assert found["arrived"] == 1.0 and found["worst_second"] is found["limsim_corrected_total"] is None
+    assert found["mean_speed"] == pytest.approx(10.0) and found["nuplan_score"] > 0
+    none = measure(free(1))
+    assert none["duration"] == 0.0 and none["mean_speed"] is none["nuplan_score"] is None
+
+
+def test_an_ego_that_was_never_there_has_no_metrics():
+    found = measure(free(STEPS, active=np.zeros((STEPS, 1), bool)))
+    assert found["out_of_time"] is found["mean_speed"] is found["nuplan_score"] is None
+
+
+def test_a_contact_at_the_start_is_judged():
+    r = record(2, (0, 0, 0, 10.0), [(LENGTH - 0.5, 0, 0, 0.0)])
+    r["active"][1:, 0] = False
+    found = measure(r)
+    assert (found["contacts"], found["duration"], found["nuplan_score"]) == (1.0, 0.0, 0.0)
 
 
 def test_the_worst_second_is_the_one_in_which_the_ego_brakes():
