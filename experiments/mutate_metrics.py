@@ -70,7 +70,7 @@ TESTS = {
 
 GUARD = "guards a division whose result is not used"
 MEMORY = "changes the memory only"
-UNSEEN = "before the first step nobody was in any zone"
+UNSEEN = "before the first step every zone is empty"
 LATER = "later steps inside give no shorter times"
 SAME: dict[tuple[str, str, str], str] = {
     ("safety", "", "1000000.0 → 3600000.0"): "stands for infinity",
