@@ -90,6 +90,34 @@ def soundness(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def random_maps(result: dict[str, Any]) -> str:
+    """Shares of maps and episodes with a fault, by kind of map."""
+    head = [
+        "kind", "maps", "not run", "episodes", "of these with a contact", "maps without a contact",
+        "episodes with a crossing against priority", "with gridlock", "with a vehicle off the road",
+        "hardest braking, m/s²", "vehicle-km",
+    ]  # fmt: skip
+    lines = [f"| {' | '.join(head)} |", f"|---{'|---:' * (len(head) - 1)}|"]
+    kinds = list(dict.fromkeys(row["kind"] for row in sorted(result["rows"], key=lambda row: row["map"])))
+    for kind in [*kinds, "all"]:
+        mine = [row for row in result["rows"] if kind in (row["kind"], "all")]
+        run = [row for row in mine if "episodes" in row]
+        bad = {name: [len(row[f"{name}_worlds"]) for row in run] for name in _FAULTS}
+        clean = 100 * sum(not count for count in bad["contact"]) / max(len(run), 1)
+        cells = [
+            kind, str(len(mine)), str(len(mine) - len(run)), f"{sum(row['episodes'] for row in run):,}",
+            str(sum(bad["contact"])), f"{clean:.1f} %",
+            *(str(sum(bad[name])) for name in _FAULTS[1:]),
+            f"{max((row['deceleration'] for row in run), default=0):.1f}",
+            f"{sum(row['vehicle_km'] for row in run):,.0f}",
+        ]  # fmt: skip
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+_FAULTS = "contact", "against", "gridlock", "off_road"
+
+
 def merge(result: dict[str, Any]) -> str:
     """Ramps of 200 m, next to SUMO."""
     rows = [
@@ -309,6 +337,7 @@ TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "maps_speed": speed,
     "merge": merge,
     "policies": policies,
+    "random_maps": random_maps,
     "soundness": soundness,
     "sweep_speed": sweep_speed,
     "traffic_against_sumo": traffic_sumo,
