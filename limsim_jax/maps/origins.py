@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Bool
+
+from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.network import Lane, Network
 from limsim_jax.maps.routing import Round, default_goals
 
@@ -25,6 +31,18 @@ def origins(network: Network) -> dict[str, tuple[str, ...]]:
         if all(lane.junction is None for lane in lanes)
         and not any(_drivable(network, x) for lane in lanes for x in lane.predecessors)
     }
+
+
+def leading(network: Network, names: Iterable[str], reachable: Bool[np.ndarray, "L G"]) -> list[str]:
+    """Those of the ways in from which some goal can be reached; all of them if there is none.
+
+    Args:
+      network: the map.
+      names: of `origins`.
+      reachable: goals by row of the lane map, as in its `routes`.
+    """
+    names, rows, lanes = list(names), lane_rows(network), origins(network)
+    return [x for x in names if reachable[[rows[lane] for lane in lanes[x]]].any()] or names
 
 
 def road_origins(network: Network, count: int) -> list[str]:

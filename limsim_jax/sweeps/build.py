@@ -12,12 +12,13 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from limsim_jax.maps import bundled_maps
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.map import Map, load_map
 from limsim_jax.maps.network import MapError, Network
-from limsim_jax.maps.origins import origins, road_origins
+from limsim_jax.maps.origins import leading, origins, road_origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.policies import POLICIES
 from limsim_jax.policies.base import PolicyLike, build_policy, seeing
@@ -176,13 +177,20 @@ def population_of(experiment: ExperimentFile, drivers: Population | None = None)
 
 
 def flows_of(experiment: ExperimentFile, town: Map) -> list[Flow]:
-    """The flows of the file; "*" stands for all origins, on a closed map for a dozen of its roads."""
+    """The flows of the file.
+
+    "*" stands for all origins from which a goal can be reached, on a closed map for a dozen of its roads.
+    """
     every = list(town.origins) or (
         road_origins(town.network, ROADS_OF_A_CLOSED_MAP) if not experiment.ego else []
     )
     found = []
+    reachable = np.asarray(town.lanes.routes.reachable)
     for flow in experiment.traffic.flow:
-        for origin in every if flow.origin == "*" else [flow.origin]:
+        goals = [flow.goal] if isinstance(flow.goal, str) else list(flow.goal or town.exits)
+        columns = [k for k, name in enumerate(town.goals) if name in goals]
+        some = leading(town.network, every, reachable[:, columns]) if town.origins else every
+        for origin in some if flow.origin == "*" else [flow.origin]:
             fields: dict[str, Any] = flow.model_dump() | {"origin": origin}
             found.append(Flow(**fields))
     return found
@@ -228,7 +236,8 @@ def plain_demand(
     Raises:
       ValueError: numbers out of range, or more vehicles than the roads hold.
     """
-    names = list(origins(network)) or road_origins(network, ROADS_OF_A_CLOSED_MAP)
+    names = leading(network, origins(network), np.asarray(lane_map.routes.reachable))
+    names = names or road_origins(network, ROADS_OF_A_CLOSED_MAP)
     flows = [Flow(origin=name, rate=rate) for name in names]
     population = restrict_to_map(default_population(), lane_map)
     demand = build_demand(

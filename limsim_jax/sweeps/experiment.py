@@ -60,7 +60,7 @@ class FlowTable(Table):
     """Vehicles that come in: see `traffic.demand.Flow`."""
 
     origin: str | list[str] = "*"
-    """Names of `limsim_jax.origins`, road or lane ids; "*": every origin of the map."""
+    """Names of `limsim_jax.origins`, road or lane ids; "*": every origin of the map that leads to a goal."""
     rate: NotNegative
     """Vehicles per hour, of each origin."""
     goal: str | dict[str, float] | None = None

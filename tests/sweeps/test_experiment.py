@@ -11,6 +11,7 @@ from traffic_worlds import bundled
 from limsim_jax.cli import common
 from limsim_jax.maps import bundled_maps
 from limsim_jax.maps.lane_map import lane_ids
+from limsim_jax.sweeps.build import plain_demand
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import ExperimentError, bundled_experiments, read_experiments
 
@@ -201,6 +202,33 @@ def test_worlds_of_a_map_that_was_edited_start_by_a_program_of_their_own(write, 
         names.append(Episodes(experiment, chunk=2).worlds.names)
     (start, run), (other_start, other_run) = names
     assert run == other_run and start != other_start
+
+
+WITHOUT_WAY_OUT = """<net version="1.20">
+<edge id="a" from="1" to="2"><lane id="a_0" index="0" speed="14" length="100" shape="0,0 100,0"/></edge>
+<edge id="b" from="2" to="3"><lane id="b_0" index="0" speed="14" length="90" shape="100,0 190,0"/></edge>
+<edge id="d" from="4" to="5"><lane id="d_0" index="0" speed="14" length="80" shape="0,50 80,50"/></edge>
+<edge id="r" from="5" to="6"><lane id="r_0" index="0" speed="9" length="120" shape="80,50 200,50"/></edge>
+<edge id="s" from="6" to="5">
+<lane id="s_0" index="0" speed="9" length="220" shape="200,50 200,100 80,100 80,50"/></edge>
+<connection from="a" to="b" fromLane="0" toLane="0" dir="s" state="M"/>
+<connection from="d" to="r" fromLane="0" toLane="0" dir="s" state="M"/>
+<connection from="r" to="s" fromLane="0" toLane="0" dir="s" state="M"/>
+<connection from="s" to="r" fromLane="0" toLane="0" dir="s" state="M"/></net>"""
+
+
+def test_flows_of_a_whole_map_come_where_a_way_leads_out(write):
+    write(WITHOUT_WAY_OUT, "town.net.xml")
+    text = 'map = "town.net.xml"\nhorizon = 9.0\nego = false\n[[traffic.flow]]\nrate = 300\n'
+    (experiment,) = read_experiments(write(text))
+    episodes = Episodes(experiment, chunk=1)
+    assert set(episodes.town.origins) == {"a", "d"}
+    assert [flow.origin for flow in episodes.flows] == ["a"]
+    town = episodes.town
+    plain_demand(town.network, town.lanes, rate=100, vehicles=0, seconds=9)
+    (experiment,) = read_experiments(write(text + 'origin = "d"\n'))
+    with pytest.raises(ExperimentError, match="flow 0 from 'd': it can reach none of the goals 'b'"):
+        Episodes(experiment, chunk=1)
 
 
 def test_lists_of_experiments(write):
