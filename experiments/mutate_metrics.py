@@ -183,6 +183,7 @@ SAME: dict[tuple[str, str, str], str] = {
         "EgoMetrics._summary",
         "carry.started & ~carry.over → ~carry.over",
     ): "an ego that has not started has no metrics",
+    ("measure", "Own.check", "0 → 1"): "a metric of one's own asks for no zones",
     ("ego", "EgoMetrics._summary", "1.0 → 3.6"): "is cut off at 1",
     (
         "ego",
@@ -403,7 +404,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--modules", nargs="+", choices=list(TESTS), default=list(TESTS), metavar="NAME")
     parser.add_argument("--every", type=int, default=1, help="only every n-th mutant")
-    parser.add_argument("--again", action="store_true", help="try those that survived, keep other results")
+    parser.add_argument(
+        "--again", action="store_true", help="try survivors that are not judged alike, keep others"
+    )
     parser.add_argument("--rest", action="store_true", help="try those not tried yet, keep other results")
     parser.add_argument("--engine", action="store_true", help="with the tests that drive the engine")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
@@ -437,7 +440,8 @@ def main() -> None:
 
         def fate(mutant: Mutant, known: dict[Any, Any] = known) -> str:
             before = known.get((mutant.function, mutant.change, mutant.nth))
-            if before == "killed" or (before and not options.again):
+            judged = before == "survived" and why(asdict(mutant)) is not None
+            if before == "killed" or judged or (before and not options.again):
                 return before
             return "survived" if survives(mutant, options.engine) else "killed"
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -13,7 +14,7 @@ from observed_worlds import CONFIG, N, crossing, records_of, seen, stacked
 
 from limsim_jax.metrics.catalog import catalog
 from limsim_jax.metrics.ego import NAMES, EgoMetrics
-from limsim_jax.metrics.measure import Metric, check_names
+from limsim_jax.metrics.measure import Metric, Own, check_names
 from limsim_jax.metrics.observer import EvaluateEgo
 from limsim_jax.metrics.reductions import measured, on_host
 
@@ -235,6 +236,30 @@ def test_memories_and_results_that_do_not_fit(attributes, message):
     with pytest.raises(ValueError, match=message) as error:
         jax.eval_shape(lambda state: measure.init(CONFIG, crossing(), state), state)
     assert "\n" not in str(error.value)
+
+
+class Told(Metric):
+    name, unit = "told", "what it is told"
+
+    def __init__(self, found):
+        self.found = found
+
+    def result(self, carry):
+        return self.found
+
+
+@pytest.mark.parametrize(
+    "found", [2, 2.0, np.float32(2), np.array(2.0), jnp.float32(2), measured(jnp.ones(()) * 2)]
+)
+def test_a_result_may_be_any_kind_of_number(found):
+    own: Any = Own(Told(found))
+    assert own._scalar(None) == ()
+    drove = SimpleNamespace(duration=jnp.float32(1), driven=jnp.bool_(True))
+    assert on_host(own.result(None, drove)) == {"told": 2.0}
+    stood = SimpleNamespace(duration=jnp.float32(0), driven=jnp.bool_(False))
+    assert on_host(own.result(None, stood)) == {"told": None}
+    absent: Any = Own(Told(measured(jnp.float32(2), jnp.bool_(False))))
+    assert on_host(absent.result(None, drove)) == {"told": None}
 
 
 def test_a_step_without_a_map_says_how_to_get_one():

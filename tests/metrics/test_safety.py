@@ -143,6 +143,7 @@ EGO = (0.0, 0.0, 0.0, 5.0, 2.0)
         # crossing from the right at 10 m/s: its front is 14.5 m from the ego's side
         ((30.0, -18.0, np.pi / 2, 5.0, 2.0), (0.0, 10.0), 1.45),
         ((60.0, -18.0, np.pi / 2, 5.0, 2.0), (0.0, 10.0), NONE),  # too early: has passed at 2.15 s
+        ((125.0, 0.0, 0.0, 5.0, 2.0), (19.9, 0.0), NONE),  # 1,200 s
     ],
 )
 def test_ttc_2d_by_hand(other, velocity, expected):
