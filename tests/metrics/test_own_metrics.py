@@ -128,8 +128,11 @@ def test_nothing_is_measured_before_the_ego_is_there_or_after_it_left():
     r["active"][:6, 0] = False
     r["active"][21:, 0] = False
     assert run(r)["slow_time"] == pytest.approx(14 * DT)
-    r["active"][:, 0] = False
-    assert run(r)["slow_time"] is None
+    r["active"][6:, 0] = np.arange(25) < 4  # for three steps
+    assert run(r)["slow_time"] == pytest.approx(3 * DT)
+    for steps in (1, 0):  # there at the start of a step, or never
+        r["active"][:, 0] = np.arange(31) < steps
+        assert run(r)["slow_time"] is None
 
 
 def test_the_description_of_an_own_metric_is_among_all():
