@@ -441,7 +441,7 @@ def main() -> None:
         def fate(mutant: Mutant, known: dict[Any, Any] = known) -> str:
             before = known.get((mutant.function, mutant.change, mutant.nth))
             judged = before == "survived" and why(asdict(mutant)) is not None
-            if before == "killed" or judged or (before and not options.again):
+            if before and (before == "killed" or judged or not options.again):
                 return before
             return "survived" if survives(mutant, options.engine) else "killed"
 
