@@ -16,8 +16,8 @@ Five ways of being wrong, each applied wherever it can be (one place at a time):
 
 A mutant is killed when a test of its module, or of a module that stands on it, fails. One that survives is
 either a hole in the tests or no change of behaviour at all; those that were judged to be of the second
-kind are in `SAME`, with the reason. Writes experiments/results/metric_mutants.json and .md; modules that
-are not named keep their rows.
+kind are in mutants_alike.json, with the reason. Writes experiments/results/metric_mutants.json and .md;
+modules that are not named keep their rows.
 """
 
 from __future__ import annotations
@@ -68,142 +68,11 @@ TESTS = {
 }
 """The tests of each module, the nearest first."""
 
-GUARD = "guards a division whose result is not used"
-MEMORY = "changes the memory only"
-UNSEEN = "before the first step every zone is empty"
-LATER = "later steps inside give no shorter times"
+ALIKE = Path(__file__).with_name("mutants_alike.json")
 SAME: dict[tuple[str, str, str], str] = {
-    ("safety", "", "1000000.0 → 3600000.0"): "stands for infinity",
-    ("safety", "", "1000.0 → 3600.0"): "stands for infinity",
-    ("safety", "ttc_1d", "1 → 2"): GUARD,
-    ("safety", "time_headway", "1 → 2"): GUARD,
-    (
-        "safety",
-        "time_headway",
-        "(v > 0) & (gap < NO_GAP) → gap < NO_GAP",
-    ): "a division by 0 is capped as well",
-    ("safety", "", "0.0001 → 0.00036"): "bodies that move by centimetres until `FORESIGHT`",
-    ("safety", "contact_interval", "1e-09 → 3.6000000000000004e-09"): "stands for nothing",
-    ("safety", "ttc_1d", "jnp.where(found, closing, 1) → jnp.where((found) | True, closing, 1)"): GUARD,
-    ("safety", "time_headway", "jnp.where(found, v, 1) → jnp.where((found) | True, v, 1)"): GUARD,
-    ("safety", "pet_init", "-NONE → NONE"): UNSEEN,
-    ("safety", "pet_init", "-1 → 1"): UNSEEN,
-    ("safety", "pet_init", "1 → 2"): "no zone has this number either",
-    (
-        "safety",
-        "pet_update",
-        "(zones.id[:, None] == carry.id[None, :]) & exists[:, None] → zones.id[:, None] == carry.id[None, :]",
-    ): "a zone that is not there has no past",
-    ("safety", "pet_update", "zones.ego & exists → zones.ego"): "a zone that is not there has no past",
-    ("safety", "pet_update", "other_was & ~other_in → other_was"): "inside, the contact of both comes first",
-    ("safety", "pet_update", "ego_in & ~ego_was → ego_in"): LATER,
-    ("safety", "pet_update", "other_in & ~other_was → other_in"): LATER,
-    ("safety", "pet_update", "ego_in & other_in & (ego_enters | other_enters) → ego_in & other_in"): LATER,
-    ("safety", "pet_update", "zones.other & exists → zones.other"): "a zone that is not there has no past",
-    ("safety", "pet_update", "ego_was & ~ego_in → ego_was"): "inside, the contact of both comes first",
-    ("motion", "stream.inner", "1e-09 → 3.6000000000000004e-09"): "tolerance of rounding",
-    ("motion", "filters", "8 → 9"): "a longer record than is needed to find the weights",
-    ("motion", "filters", "15 → 16"): "a longer record than is needed to find the weights",
-    ("motion", "filters", "2 → 3"): "a longer record than is needed to find the weights",
-    ("motion", "filters", "5 → 6"): "a longer record than is needed to find the weights",
-    ("blame", "avoidable_by_braking", "jnp.where(v > 0, v, 0) → jnp.where((v > 0) | True, v, 0)"): (
-        "speeds are not negative"
-    ),
-    ("blame", "avoidable_by_braking", "1e-06 → 3.6e-06"): "tolerance of rounding",
-    ("blame", "avoidable_by_braking", "1.0 → 3.6"): GUARD,
-    ("blame", "ContactCarry.touched", "0 → 1"): "the flag is 32",
-    ("blame", "", "12 → 13"): "allows more slots",
-    ("blame", "contact_init", "1 → 2"): "invalid before the first contact",
-    ("blame", "contact_update", "(number > 0) & (carry.contacts == 0) → carry.contacts == 0"): (
-        "invalid before the first contact"
-    ),
-    ("blame", "avoidable_by_braking", "1 → 2"): "any end before the beginning means never",
-    ("blame", "_notes", "0 → 1"): "flags are larger, and without a hazard notes are not used",
-    ("scores", "limsim_update", "1 → 2"): "seconds that are not full do not count",
-    ("scores", "limsim_corrected", "0 → 1"): "the filters need two seconds anyway",
-    ("traffic", "TrafficMetrics.init", "-1 → 1"): "no vehicle has passed a detector before the start",
-    (
-        "traffic",
-        "TrafficMetrics._detect",
-        "1 → 2",
-    ): "moves all passages by a step, and headways are differences",
-    ("observer", "_flow", "0 → 1"): "the detectors are none of those that are kept",
-    ("record", "ego_step", "-1 → 1"): "the last axis of two is the second",
-    ("record", "meets_ego", "-1 → 1"): "the last axis of two is the second",
-    ("record", "ego_step", "0 → 1"): "filled in by `EvaluateEgo._advance`",
-    ("record", "conflict_zones", "1 → 2"): "before the lane in any case",
-    ("record", "_speed_around", "-1 → 1"): "the last axis of two is the second",
-    (
-        "step",
-        "StepView.v_leader",
-        "jnp.where(self.has_leader, self.speeds[self.leader], 0) → "
-        "jnp.where((self.has_leader) | True, self.speeds[self.leader], 0)",
-    ): "without a leader the gap is `NO_GAP`",
-    (
-        "step",
-        "StepView.has_leader",
-        "(self.leader >= 0) & self.record.active[self.leader] → self.record.active[self.leader]",
-    ): "without a leader the gap is `NO_GAP`",
-    ("step", "StepView.v_leader", "0 → 1"): "without a leader the gap is `NO_GAP`",
-    (
-        "step",
-        "StepView.least_ttc_1d",
-        "self.has_leader & ~self.touched[self.leader] → ~self.touched[self.leader]",
-    ): "without a leader the gap is `NO_GAP`",
-    ("course", "aside", "shown * w → shown / w"): "only the sign counts, and without speed nothing moves",
-    ("course", "aside", "state.d * w → state.d / w"): "only the sign counts",
-    (
-        "course",
-        "aside",
-        "over & (state.d * w < 0) → over",
-    ): "over the line and outwards it leaves in any case",
-    (
-        "course",
-        "aside",
-        "state.active & jnp.where(free, leaves | over & (state.d * w < 0), state.side != 0) → "
-        "jnp.where(free, leaves | over & (state.d * w < 0), state.side != 0)",
-    ): "empty slots are not looked at",
-    ("course", "course", "-1 → 1"): "the last axis of two is the second",
-    ("course", "_ahead", "-1 → 1"): "the last axis of two is the second",
-    ("course", "_ahead", "0 → 1"): "where there is no lane, nothing lies beyond",
-    (
-        "measures.rss",
-        "ResponsibilityDistances.update",
-        "step.has_leader & (step.gap < rss_longitudinal(step.v, step.v_leader, rss)) → "
-        "step.gap < rss_longitudinal(step.v, step.v_leader, rss)",
-    ): "without a leader the gap is `NO_GAP`",
-    (
-        "measures.rss",
-        "ResponsibilityDistances.update",
-        "unsafe & (since > rss.response + dt / 2) → since > rss.response + dt / 2",
-    ): "`since` is 0 where the distance is kept",
-    ("ego", "EgoMetrics.update", "carry.over | arrives → arrives"): "what is over is not there either",
-    (
-        "ego",
-        "EgoMetrics._summary",
-        "carry.started & ~carry.over → ~carry.over",
-    ): "an ego that has not started has no metrics",
-    ("measure", "Own.check", "0 → 1"): "a metric of one's own asks for no zones",
-    ("ego", "EgoMetrics._summary", "1.0 → 3.6"): "is cut off at 1",
-    (
-        "ego",
-        "EgoMetrics._summary",
-        "carry.started & (duration > 0) → duration > 0",
-    ): "what has not started has lasted 0 s",
-    (
-        "ego",
-        "EgoMetrics._summary",
-        "carry.started & (failed | (duration > 0)) → failed | (duration > 0)",
-    ): "what has not started has lasted 0 s and not failed",
-    (
-        "measures.scores",
-        "LimSim.result",
-        "summary.started & summary.failed → summary.failed",
-    ): "what has not started has not failed",
-    ("measures.rss", "ResponsibilityDistances.update", "2 → 3"): "tolerance of rounding",
-    ("measures.rss", "ResponsibilityDistances.update", "0.01 → 0.036000000000000004"): (
-        "tolerance of rounding"
-    ),
+    (found["module"], found["function"], change): found["why"]
+    for found in json.loads(ALIKE.read_text(encoding="utf-8"))
+    for change in found["changes"]
 }
 """(module, function, change): why the mutants behave as the original does."""
 
