@@ -23,10 +23,10 @@ from limsim_jax.maps import build_lane_map
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.network import Control, Network
-from limsim_jax.maps.origins import leading, origins, road_origins
+from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.signal_table import SignalState
-from limsim_jax.sweeps.build import ROADS_OF_A_CLOSED_MAP
+from limsim_jax.sweeps.build import plain_origins
 from limsim_jax.traffic.demand import Demand, Flow, build_demand
 from limsim_jax.traffic.vehicles import default_population, restrict_to_map
 
@@ -141,9 +141,7 @@ def demand_of(loaded: Loaded, level: str, seed: int, seconds: float) -> tuple[De
     Returns it and the rate of all origins together, veh/h.
     """
     network, lane_map, _ = loaded
-    names = leading(network, origins(network), np.asarray(lane_map.routes.reachable))
-    names = names or road_origins(network, ROADS_OF_A_CLOSED_MAP)
-    lanes = origins(network)
+    names, lanes = plain_origins(network, lane_map), origins(network)
     rng = np.random.default_rng([seed, 1])
     rates = {name: FIRST_RATE * len(lanes.get(name, [""])) * float(rng.uniform(0.6, 1.4)) for name in names}
     flow = _flows(lane_map, _build(loaded, rates, 0, seconds))

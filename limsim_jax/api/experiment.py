@@ -25,7 +25,6 @@ from limsim_jax.sweeps.experiment import (
     first_fault,
     read_experiments,
 )
-from limsim_jax.sweeps.sumo_files import resolved
 
 if TYPE_CHECKING:
     from limsim_jax.api.world import World
@@ -180,9 +179,9 @@ class Experiment:
             table["map"] = self._town.source if self._town.name not in bundled_maps() else self._town.name
         elif isinstance(map, str | Path):
             table["map"] = str(map)
-        table = _seen(table)
+        table = _file.with_demand(table, Path(), table.get("name", "Experiment"))
         if "name" not in table and "map" in table:
-            table["name"] = "".join(c if c.isalnum() or c in "_-" else "_" for c in Path(table["map"]).stem)
+            table["name"] = _file.name_of(Path(table["map"]))
         self.file = _checked(table)
         self.policy = None if isinstance(policy, str) else policy
         self.drivers = None if isinstance(drivers, str | Path) else drivers
@@ -310,14 +309,6 @@ def _checked(table: Mapping[str, Any]) -> ExperimentFile:
 
 def _paths(files: str | Path | Sequence[str | Path]) -> list[str]:
     return [str(file) for file in ([files] if isinstance(files, str | Path) else files)]
-
-
-def _seen(table: dict[str, Any]) -> dict[str, Any]:
-    """The fields with a demand seen from here."""
-    try:
-        return resolved(table, Path())
-    except MapError as error:
-        raise ExperimentError(f"{table.get('name', 'Experiment')}: traffic.demand: {error}") from None
 
 
 def _number(x: float | None) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool
@@ -33,16 +33,18 @@ def origins(network: Network) -> dict[str, tuple[str, ...]]:
     }
 
 
-def leading(network: Network, names: Iterable[str], reachable: Bool[np.ndarray, "L G"]) -> list[str]:
-    """Those of the ways in from which some goal can be reached; all of them if there is none.
+def leading(
+    network: Network, ways: Mapping[str, Sequence[str]], reachable: Bool[np.ndarray, "L G"]
+) -> list[str]:
+    """Names of the ways in from which some goal can be reached; all of them if there is none.
 
     Args:
       network: the map.
-      names: of `origins`.
+      ways: as `origins`.
       reachable: goals by row of the lane map, as in its `routes`.
     """
-    names, rows, lanes = list(names), lane_rows(network), origins(network)
-    return [x for x in names if reachable[[rows[lane] for lane in lanes[x]]].any()] or names
+    rows = lane_rows(network)
+    return [x for x, lanes in ways.items() if reachable[[rows[y] for y in lanes]].any()] or list(ways)
 
 
 def road_origins(network: Network, count: int) -> list[str]:

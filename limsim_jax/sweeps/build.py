@@ -26,7 +26,7 @@ from limsim_jax.policies.several import Several
 from limsim_jax.policies.view import view_of
 from limsim_jax.sweeps.experiment import EgoTable, ExperimentError, ExperimentFile
 from limsim_jax.sweeps.places import placed, vehicles_of
-from limsim_jax.sweeps.sumo import town_of
+from limsim_jax.sweeps.sumo import with_lights
 from limsim_jax.traffic import car_following
 from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand
 from limsim_jax.traffic.engine import Traffic
@@ -111,11 +111,10 @@ def _own(name: str, where: str) -> Callable[..., PolicyLike]:
 
 
 def map_of(experiment: ExperimentFile, town: Map | None = None) -> Map:
-    """The map, with lanes and routes that are named as goals."""
+    """The map with the named goals and the lights of SUMO's demand."""
     if town is None:
         try:
-            named = bundled_maps().get(experiment.map, experiment.map)
-            town = town_of(experiment) or load_map(named)
+            town = load_map(bundled_maps().get(experiment.map, experiment.map))
         except MapError as error:
             known = ", ".join(bundled_maps())
             hint = "" if os.path.exists(experiment.map) else f"; bundled maps are {known}"
@@ -124,7 +123,7 @@ def map_of(experiment: ExperimentFile, town: Map | None = None) -> Map:
     wanted = [x.goal for x in named if x.goal]
     for flow in experiment.traffic.flow:
         wanted += [flow.goal] if isinstance(flow.goal, str) else list(flow.goal or ())
-    return town.with_goals(wanted, [x.route for x in named if x.route])
+    return with_lights(experiment, town).with_goals(wanted, [x.route for x in named if x.route])
 
 
 def egos_of(experiment: ExperimentFile, town: Map, policy: PolicyLike) -> EgoStart | None:
@@ -181,16 +180,14 @@ def flows_of(experiment: ExperimentFile, town: Map) -> list[Flow]:
 
     "*" stands for all origins from which a goal can be reached, on a closed map for a dozen of its roads.
     """
-    every = list(town.origins) or (
-        road_origins(town.network, ROADS_OF_A_CLOSED_MAP) if not experiment.ego else []
-    )
-    found = []
+    inside = road_origins(town.network, ROADS_OF_A_CLOSED_MAP) if not experiment.ego else []
     reachable = np.asarray(town.lanes.routes.reachable)
+    found = []
     for flow in experiment.traffic.flow:
         goals = [flow.goal] if isinstance(flow.goal, str) else list(flow.goal or town.exits)
         columns = [k for k, name in enumerate(town.goals) if name in goals]
-        some = leading(town.network, every, reachable[:, columns]) if town.origins else every
-        for origin in some if flow.origin == "*" else [flow.origin]:
+        every = leading(town.network, town.origins, reachable[:, columns]) or inside
+        for origin in every if flow.origin == "*" else [flow.origin]:
             fields: dict[str, Any] = flow.model_dump() | {"origin": origin}
             found.append(Flow(**fields))
     return found
@@ -216,6 +213,12 @@ def demand_of(
         raise ExperimentError(f"{experiment.name}: traffic: {error}") from None
 
 
+def plain_origins(network: Network, lane_map: LaneMap) -> list[str]:
+    """Origins from which a goal can be reached; on a closed map a dozen of its roads."""
+    ways = leading(network, origins(network), np.asarray(lane_map.routes.reachable))
+    return ways or road_origins(network, ROADS_OF_A_CLOSED_MAP)
+
+
 def plain_demand(
     network: Network, lane_map: LaneMap, *, rate: float, vehicles: int, seconds: float
 ) -> tuple[Demand, int]:
@@ -236,8 +239,7 @@ def plain_demand(
     Raises:
       ValueError: numbers out of range, or more vehicles than the roads hold.
     """
-    names = leading(network, origins(network), np.asarray(lane_map.routes.reachable))
-    names = names or road_origins(network, ROADS_OF_A_CLOSED_MAP)
+    names = plain_origins(network, lane_map)
     flows = [Flow(origin=name, rate=rate) for name in names]
     population = restrict_to_map(default_population(), lane_map)
     demand = build_demand(

@@ -124,9 +124,9 @@ class Episodes:
         self._check_success()
         self._demand = demand_of(experiment, self.town, self._egos, drivers, self._placed)
         self._sumo = sumo_of(experiment, self.town)
-        notes = [] if self._sumo is None else self._sumo.notes
-        notes = [f"{experiment.name}: traffic.demand: {note}" for note in notes]
-        for doubt in [*doubts(experiment, self.town), *notes]:
+        notes = () if self._sumo is None else self._sumo.notes
+        said = (f"{experiment.name}: traffic.demand: {note}" for note in notes)
+        for doubt in [*doubts(experiment, self.town), *said]:
             warnings.warn(doubt, stacklevel=2)
         self._check_room()
         config = Config(dt=experiment.dt, decision_every=experiment.decision_every)
@@ -138,10 +138,12 @@ class Episodes:
         self.chunk = self._chunk() if chunk is None else chunk
         run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
         source, slots = _source_hash(), experiment.slots
-        sumo = None if self._sumo is None else self._sumo.tables
-        drawn = self.lane_map, self._demand, sumo, self._egos, self._placed, self._script, slots
+        sumo = self._sumo
+        drawn = self.lane_map, self._demand, self._egos, self._placed, self._script, slots
+        if sumo is not None:
+            drawn += sumo.tables
         names = (
-            None if self._by_chance else describe_program(source, *drawn),
+            None if sumo is not None and sumo.random else describe_program(source, *drawn),
             describe_program(source, replace(run, horizon=1.0)),  # programs run for any time
         )
         self.worlds = Worlds(run, self.lane_map, self.sample, chunk=self.chunk, names=names)
@@ -171,11 +173,6 @@ class Episodes:
     def lane_map(self) -> LaneMap:
         """The map on the device."""
         return self.town.lanes if self._sumo is None else self._sumo.lane_map
-
-    @property
-    def _by_chance(self) -> bool:
-        """Whether departures are drawn on the host: such a program cannot be kept on disk."""
-        return self._sumo is not None and self._sumo.random
 
     def under(self, policy: PolicyLike) -> Episodes:
         """The same worlds under another policy."""
@@ -292,7 +289,7 @@ class Episodes:
         demand = files_of(self.experiment)
         return {
             **({"drivers": file_hash(Path(drivers).read_bytes())} if drivers is not None else {}),
-            **({"demand": {path.name: file_hash(path.read_bytes()) for path in demand}} if demand else {}),
+            **({"demand": {str(path): file_hash(path.read_bytes()) for path in demand}} if demand else {}),
             **{name: describe(value) for name, value in self._values.items() if value and name != "policy"},
             **({"policy": without_sources(describe(policy))} if policy is not None else {}),
             **({"policy_code": self._code} if self._code else {}),

@@ -6,6 +6,7 @@ Whatever is wrong is one line that names the file and the field.
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -282,10 +283,7 @@ def _experiment(
         found["map"] = map_file
     elif isinstance(found.get("map"), str) and (path.parent / found["map"]).exists():
         found["map"] = str(path.parent / found["map"])
-    try:
-        found = resolved(found, path.parent)
-    except MapError as error:
-        raise ExperimentError(f"{path}: traffic.demand: {error}") from None
+    found = with_demand(found, path.parent, path)
     traffic = found.get("traffic")
     if isinstance(traffic, dict) and isinstance(traffic.get("drivers"), str):
         drivers = path.parent / traffic["drivers"]
@@ -297,6 +295,19 @@ def _experiment(
         return ExperimentFile.model_validate(found)
     except ValidationError as error:
         raise ExperimentError(f"{path}: {first_fault(error)}") from None
+
+
+def with_demand(table: Mapping[str, Any], folder: Path, where: str | Path) -> dict[str, Any]:
+    """The fields of an experiment, its demand seen from a folder."""
+    try:
+        return resolved(table, folder)
+    except MapError as error:
+        raise ExperimentError(f"{where}: traffic.demand: {error}") from None
+
+
+def name_of(path: Path) -> str:
+    """A file's name as that of an experiment."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", path.stem)
 
 
 def with_policy(ego: Any, policy: str, where: str | Path) -> Any:

@@ -76,6 +76,7 @@ _CHANGED = {
     r"policy_code\.program": "the program of the policy has changed since",
     r"policy_code\.values": "the numbers that the policy holds have changed since",
     r"policy_code\.sources\.": "the policy's code in {} has changed since",
+    r"demand\.": "the demand in {} has changed since",
     r"policy_code": "it is not known with which code of the policy they were made",
 }
 """Differences of provenance in words; what follows in the name goes into the braces."""

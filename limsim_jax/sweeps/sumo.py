@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +15,8 @@ from limsim_jax.maps.sumo import read_demand
 from limsim_jax.maps.sumo.reader import read_sumo
 from limsim_jax.maps.sumo.records import Demand
 from limsim_jax.maps.xml import read_bytes
-from limsim_jax.sweeps.experiment import ExperimentError, ExperimentFile
-from limsim_jax.sweeps.sumo_files import Inputs, inputs
+from limsim_jax.sweeps.experiment import ExperimentError, ExperimentFile, name_of
+from limsim_jax.sweeps.sumo_files import inputs
 from limsim_jax.traffic.demand.sumo import SumoDemand
 
 AFTERWARDS = 600.0
@@ -40,7 +43,7 @@ def experiment_of(path: Path) -> dict[str, Any]:
         demand = read_demand(given.files)
         end = max(_departures(demand, path), default=begin) + AFTERWARDS
     table: dict[str, Any] = {
-        "name": "".join(c if c.isalnum() or c in "_-" else "_" for c in path.stem),
+        "name": name_of(path),
         "map": str(given.network),
         "horizon": float(end - begin),
         "ego": False,
@@ -49,7 +52,7 @@ def experiment_of(path: Path) -> dict[str, Any]:
     if not end > begin:
         raise ExperimentError(f"{path}: ends at {end:g} s, but begins at {begin:g} s")
     plain = ExperimentFile.model_validate(table)
-    found = sumo_of(plain, town_of(plain) or load_map(plain.map))
+    found = sumo_of(plain, with_lights(plain, load_map(plain.map)))
     assert found is not None
     return table | {"slots": min(max(math.ceil(ROOM * found.at_once()), 64), 4096)}
 
@@ -67,12 +70,17 @@ def _departures(demand: Demand, path: Path) -> list[float]:
     return [x for x in times if math.isfinite(x)]
 
 
-def town_of(experiment: ExperimentFile) -> Map | None:
-    """The map with the lights' programs of the demand; None if it has none."""
-    if not experiment.traffic.demand or not experiment.map.endswith((".net.xml", ".net.xml.gz")):
-        return None
-    programs = [path for path in _inputs(experiment).files if b"<tlLogic" in _bytes(experiment, path)]
-    return load_map(read_sumo(experiment.map, programs)) if programs else None
+def with_lights(experiment: ExperimentFile, town: Map) -> Map:
+    """The map with the programs of lights that the demand brings.
+
+    Raises:
+      ExperimentError: a file that cannot be used; one line.
+    """
+    if not town.source.endswith((".net.xml", ".net.xml.gz")):
+        return town
+    with _named(experiment):
+        programs = [path for path in files_of(experiment) if b"<tlLogic" in read_bytes(path)]
+        return replace(town, network=read_sumo(town.source, programs)) if programs else town
 
 
 def sumo_of(experiment: ExperimentFile, town: Map) -> SumoDemand | None:
@@ -83,30 +91,24 @@ def sumo_of(experiment: ExperimentFile, town: Map) -> SumoDemand | None:
     """
     if not experiment.traffic.demand:
         return None
-    given, wanted = _inputs(experiment), experiment.traffic.begin
-    try:
+    wanted = experiment.traffic.begin
+    with _named(experiment):
+        given = inputs(experiment.traffic.demand)
         return SumoDemand(
             town.network, town.lanes, read_demand(given.files, town.network),
             seconds=experiment.horizon, begin=given.begin if wanted is None else wanted,
         )  # fmt: skip
-    except (MapError, ValueError) as error:
-        raise ExperimentError(f"{experiment.name}: traffic.demand: {error}") from None
-
-
-def _inputs(experiment: ExperimentFile) -> Inputs:
-    try:
-        return inputs(experiment.traffic.demand)
-    except MapError as error:
-        raise ExperimentError(f"{experiment.name}: traffic.demand: {error}") from None
-
-
-def _bytes(experiment: ExperimentFile, path: Path) -> bytes:
-    try:
-        return read_bytes(path)
-    except MapError as error:
-        raise ExperimentError(f"{experiment.name}: traffic.demand: {error}") from None
 
 
 def files_of(experiment: ExperimentFile) -> tuple[Path, ...]:
     """The files of demand that the rows depend on."""
-    return _inputs(experiment).files if experiment.traffic.demand else ()
+    return inputs(experiment.traffic.demand).files
+
+
+@contextmanager
+def _named(experiment: ExperimentFile) -> Iterator[None]:
+    """Errors name the experiment and the field."""
+    try:
+        yield
+    except (MapError, ValueError) as error:
+        raise ExperimentError(f"{experiment.name}: traffic.demand: {error}") from None

@@ -129,6 +129,11 @@ def test_fresh_starts_anew_and_leaves_other_policies(tmp_path):
             {"policy_code": {"values": "b"}},
             "the numbers that the policy holds",
         ),
+        (
+            {"demand": {"cars.rou.xml": "a"}},
+            {"demand": {"cars.rou.xml": "b"}},
+            "the demand in cars.rou.xml has changed since",
+        ),
         ({}, {"policy_code": {"program": "a"}}, "not known with which code of the policy they were made"),
     ],
 )

@@ -138,7 +138,14 @@ def test_what_sumo_leaves_to_chance_differs_by_seed(experiment):
 @pytest.mark.engine
 def test_programs_of_lights_come_with_the_demand(folder):
     (experiment,) = read_experiments(folder / "morning.sumocfg")
-    episodes = Episodes(experiment, chunk=1)
+    by_keywords = lj.Experiment(
+        map=lj.load_map(folder / "town.net.xml"), demand=folder / "morning.sumocfg", ego=None, horizon=60
+    )
+    for episodes in (Episodes(experiment, chunk=1), by_keywords.episodes(chunk=1)):
+        _are_those_of_the_demand(episodes)
+
+
+def _are_those_of_the_demand(episodes):
     row = list(episodes.network.programs).index("y")
     assert float(episodes.lane_map.signals.cycle[row]) == 12.0
     assert float(episodes.lane_map.signals.offset[row]) == -100 % 12  # the clock is that of the files

@@ -150,8 +150,10 @@ class SumoDemand:
         self._end, self._network, self._demand = self.begin + seconds, network, demand
         self._ways = _Ways(network, lane_map)
         self._types = self._every_way()
+        self.random = _leaves_to_chance(demand)
+        """Whether departures, types, routes or places are drawn; drivers always are."""
         departures = self._draw([0], notes := _Notes())
-        if not self._ways.columns or not (departures or _leaves_to_chance(demand)):
+        if not self._ways.columns or not (departures or self.random):
             why = "; ".join(notes.lines()) or f"from {self.begin:g} to {self._end:g} s none is due"
             raise ValueError(f"the demand has no vehicle that departs: {why}")
         self.notes = tuple(notes.lines())
@@ -161,12 +163,9 @@ class SumoDemand:
         )
         self._size = bucket(self._most(len(departures)), LEAST_ROWS)
         self._population = from_vtypes([demand.types[name] for name in self._types])
-        self.random = _leaves_to_chance(demand)
-        """Whether departures, types, routes or places are drawn; drivers always are."""
-        known = lane_map.routes.distance.shape[1]
-        self._first_goal = known
-        found = self._ways.table(lane_map.routes)
-        self.lane_map = replace(lane_map, routes=found, signals=_signals_from(lane_map, self.begin))
+        self._first_goal = lane_map.routes.distance.shape[1]
+        routes = self._ways.table(lane_map.routes)
+        self.lane_map = replace(lane_map, routes=routes, signals=_signals_from(lane_map, self.begin))
         self._fixed = self._as_rows(departures)
 
     @property
@@ -176,11 +175,11 @@ class SumoDemand:
 
     def at_once(self) -> int:
         """Vehicles on the road at once, at half the limits."""
-        rows, table = self._fixed, jax.tree.map(np.asarray, self.lane_map)
+        rows, distance = self._fixed, np.asarray(self.lane_map.routes.distance)
         come = rows.lane != NO_LANE
         lane, goal, time = rows.lane[come], rows.goal[come], rows.time[come]
         limit = np.median([x.speed_limit for x in self._network.drivable_lanes()])
-        leave = time + table.routes.distance[lane, goal] / (0.5 * limit)
+        leave = time + distance[lane, goal] / (0.5 * limit)
         order = np.argsort([*time, *leave], kind="stable")
         return int(np.max(np.cumsum(np.where(order < len(time), 1, -1)), initial=0))
 
@@ -207,24 +206,22 @@ class SumoDemand:
 
     def _every_way(self) -> list[str]:
         """Find the ways of all types on all routes; return the types."""
-        demand, rng, found, types = self._demand, np.random.default_rng(0), [], {}
-        flows = [flow.vehicle for flow in demand.flows.values()]
-        for vehicle in [*demand.vehicles.values(), *flows]:
-            for name in _members(demand.type_distributions, vehicle.type):
-                kind = demand.types.get(name)
-                if kind is None or kind.engine_class is None:  # it is said where it is drawn
-                    continue
-                types[name] = None
-                for route in _members(demand.route_distributions, vehicle.route):
-                    edges = _edges(demand, replace(vehicle, route=route), rng)
-                    found.append(
-                        (_Departure(id=vehicle.id, number=0, time=0, vehicle=vehicle, type=name), edges)
-                    )
-        for departure, edges in sorted(found, key=lambda pair: -len(pair[1])):
-            if edges:
-                kind = demand.types[departure.type]
-                _way(self._network, self._ways, departure, edges, kind, {}, rng, _Notes())
-        return list(types)
+        demand, rng = self._demand, np.random.default_rng(0)
+        ways: dict[tuple[str, tuple[str, ...], bool], Vehicle] = {}
+        for vehicle in [*demand.vehicles.values(), *(flow.vehicle for flow in demand.flows.values())]:
+            types = _members(demand.type_distributions, vehicle.type)
+            for route in _members(demand.route_distributions, vehicle.route):
+                edges = _edges(demand, replace(vehicle, route=route), rng)
+                for name in types if edges else []:
+                    ways.setdefault((name, edges, route is None), vehicle)
+        found: dict[str, None] = {}
+        for (name, edges, _), vehicle in sorted(ways.items(), key=lambda way: -len(way[0][1])):
+            kind = demand.types.get(name)
+            if kind is not None and kind.engine_class is not None:  # otherwise it is said where it is drawn
+                found[name] = None
+                one = _Departure(id=vehicle.id, number=0, time=0, vehicle=vehicle, type=name)
+                _way(self._network, self._ways, one, edges, kind, {}, rng, _Notes())
+        return list(found)
 
     def _most(self, drawn: int) -> int:
         """Vehicles that depart in any world, at most."""
@@ -613,10 +610,8 @@ class _Rows(NamedTuple):
 
 def _rows(placed: list[_Departure], lanes: list[int], types: list[str], begin: float, rows: int) -> _Rows:
     """Departures as arrays of `rows` rows, with a queue for each lane."""
-    placed = sorted(placed, key=lambda d: (d.row, d.time))
-    if len(placed) > rows:  # never, but for draws beyond `FEW` in a row
-        latest = sorted(placed, key=lambda d: d.time)[rows:]
-        placed = [d for d in placed if d not in latest]
+    first = sorted(placed, key=lambda d: d.time)[:rows]  # all, but for draws beyond `FEW`
+    placed = sorted(first, key=lambda d: (d.row, d.time))
 
     def table(values: list[float], fill: float, dtype: type) -> NDArray[Any]:
         return np.array(values + [fill] * (rows - len(values)), dtype)
