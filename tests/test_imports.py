@@ -28,9 +28,10 @@ ORDER = [
     {"metrics"},
     {"sweeps", "calibration"},
     {"training"},
-    {"report", "bridges"},
+    {"report"},
     {"api"},
     {"log_replay"},
+    {"bridges"},
     {"bench"},
     {"cli"},
 ]
