@@ -33,6 +33,8 @@ AHEAD = math.radians(45.0)
 """Largest change of heading (rad) from a lane to the one that it leads to."""
 
 _SAMPLE = 0.25  # m between samples of a bridge
+_BACK = 2.0  # rad, turn on the spot beyond which the next lane leads back ...
+_ASIDE = 0.5  # m: ... if it is as far away
 _REACH = 0.6  # length of the tangents of the cubic at both ends, as a share of the gap, on a straight way
 
 
@@ -61,7 +63,9 @@ def bridge_lanes(
     for before in [lane for lane in lanes.values() if lane.drivable]:
         for after in (lanes[name] for name in before.successors):
             gap = _gap(before, after)
-            if not after.drivable or gap <= LEAP * max(min(before.width[-1], after.width[0]), 1.0):
+            leaps = gap > LEAP * max(min(before.width[-1], after.width[0]), 1.0)
+            leaps |= gap > _ASIDE and _turn(before, after) > _BACK
+            if not after.drivable or not leaps:
                 continue
             if goes_on_beside(lanes, before, after) is not None:
                 continue  # traffic changes lanes before
@@ -123,7 +127,7 @@ def _begins_at(lanes: Mapping[str, Lane], before: Lane, after: Lane) -> Lane | N
         and lane.drivable
         and lane.id not in before.successors
         and _gap(before, lane) <= min(COINCIDE, lane.width[0] / 2)
-        and abs(math.remainder(lane.heading[0] - before.heading[-1], 2 * math.pi)) <= AHEAD
+        and _turn(before, lane) <= AHEAD
     ]
     return min(found, key=lambda lane: _gap(before, lane), default=None)
 
@@ -131,6 +135,11 @@ def _begins_at(lanes: Mapping[str, Lane], before: Lane, after: Lane) -> Lane | N
 def _gap(before: Lane, after: Lane) -> float:
     """Distance (m) from the end of a lane to another, from above."""
     return float(np.linalg.norm(after.xyz[0, :2] - before.xyz[-1, :2]))
+
+
+def _turn(before: Lane, after: Lane) -> float:
+    """Angle (rad) between the end of a lane and the start of another."""
+    return abs(math.remainder(after.heading[0] - before.heading[-1], 2 * math.pi))
 
 
 def bridge(network: Network) -> Network:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool
 
+from limsim_jax.maps.conflicts.overlaps import CLEARANCE
 from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.network import Lane, Network
 from limsim_jax.maps.routing import Round, default_goals
@@ -15,22 +16,45 @@ LEAST_LENGTH = 60.0
 """m: `road_origins` names no shorter road."""
 
 _NARROW = 2.0  # m: no vehicle enters on a narrower lane
+_CAR = 5.0  # m, length of a car
 
 
 def origins(network: Network) -> dict[str, tuple[str, ...]]:
     """The ways into a map: groups of lane ids by name.
 
     One per road and direction by which traffic comes in: the first lanes, none of which has a drivable
-    predecessor. A lane that starts beside one that continues is no origin, nor is one narrower than a car.
-    Closed maps have none. Names are road ids, with `+` or `-` for the sign of the lane numbers where a
-    road has traffic both ways (OpenDRIVE).
+    predecessor. A lane that starts beside one that continues is no origin, nor is one narrower than a car,
+    or so short that a car that comes in would lie on another road. Closed maps have none. Names are road
+    ids, with `+` or `-` for the sign of the lane numbers where a road has traffic both ways (OpenDRIVE).
     """
-    return {
-        name: tuple(lane.id for lane in lanes if lane.width_at(min(5.0, lane.length)) >= _NARROW)
+    found = {
+        name: tuple(lane.id for lane in lanes if lane.width_at(min(_CAR, lane.length)) >= _NARROW)
         for name, lanes in road_starts(network).items()
         if all(lane.junction is None for lane in lanes)
         and not any(_drivable(network, x) for lane in lanes for x in lane.predecessors)
     }
+    return {
+        name: lanes
+        for name, lanes in found.items()
+        if not any(_lies_on_others(network, network.lanes[x]) for x in lanes)
+    }
+
+
+def _lies_on_others(network: Network, lane: Lane) -> bool:
+    """Whether a car at the start of a lane lies on a lane of another road behind it."""
+    if lane.length >= _CAR:
+        return False
+    back = np.arange(0.5, _CAR - lane.length, 0.5)
+    ahead = np.array([np.cos(lane.heading[0]), np.sin(lane.heading[0])])
+    body = lane.xyz[0, :2] - back[:, None] * ahead
+    for other in network.drivable_lanes():
+        if other.road == lane.road or abs(other.xyz[:, 2].mean() - lane.xyz[0, 2]) > CLEARANCE:
+            continue
+        s = np.linspace(0.0, other.length, 2 + int(other.length))
+        away = np.linalg.norm(other.pose(s)[0][None, :, :2] - body[:, None], axis=-1)
+        if away.min() < other.width_at(s[away.argmin() % len(s)]) / 2:
+            return True
+    return False
 
 
 def leading(

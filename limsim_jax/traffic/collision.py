@@ -188,7 +188,8 @@ def off_road(
 
     The road is the lanes for motor traffic: shoulders do not count, and in a junction only its lanes do. At
     the edge of the map the road is taken to go on. Traffic that keeps to lanes is checked by its offset and
-    the widths of its lane and the neighbour; a body wider than its lane does not count for that. Of free
+    the widths of its lane and the neighbour; a body wider than its lane does not count for that. Until it
+    has left the lane before a junction, the road goes on as wide as there. Of free
     egos every corner of the box is checked against the lane and its neighbours, then against the nearest
     lane of the map and its neighbours.
 
@@ -199,7 +200,11 @@ def off_road(
       free: False is for worlds without free egos, and compiles much faster.
     """
     half, own = state.shape.width / 2, width(lane_map, state.lane, state.s) / 2
-    edge = jnp.maximum(own, half) + _beside(lane_map, state.lane, state.s, jnp.where(state.d > 0, 1, -1))
+    side = jnp.where(state.d > 0, 1, -1)
+    before = _beside(lane_map, state.previous, lane_map.length[state.previous], side)
+    enters = (lane_map.junction[state.lane] >= 0) & (lane_map.junction[state.previous] < 0)
+    before = jnp.where(enters & (state.s < state.shape.length), before, 0)
+    edge = jnp.maximum(own, half) + jnp.maximum(_beside(lane_map, state.lane, state.s, side), before)
     off = state.active & (jnp.abs(state.d) + half > edge + OVERHANG)
     if not free or state.egos.slot.shape[0] == 0:
         return off

@@ -185,8 +185,9 @@ def decide(
 def _give_up(lane_map: LaneMap, state: State) -> State:
     """Give vehicles stuck at the end of a wrong lane another goal.
 
-    That is the nearest one that the lane does lead to, without another lane change if possible. From a lane
-    that ends it is the nearest one on the other side. It is recorded as `Status.MISSED_ROUTE`. On fast roads
+    That is the nearest one that the lane does lead to, without another lane change if possible. A lane change
+    that stands at the end of such a lane is given up. From a lane that ends it is the nearest goal on the
+    other side. It is recorded as `Status.MISSED_ROUTE`. On fast roads
     drivers give up sooner.
     """
     routes = lane_map.routes
@@ -206,7 +207,8 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
     lane = jnp.where(before, after, state.lane)
     to_end = lane_map.end_s[state.lane] - state.s
     near = to_end < jnp.where(before, NO_ROOM, DRIVING.end_room)
-    stuck = state.active & ~leads_on[lane, state.goal] & (state.waiting > patience) & near & (state.side == 0)
+    keeps = (state.side == 0) | (~state.crossed & ends_well[lane])
+    stuck = state.active & ~leads_on[lane, state.goal] & (state.waiting > patience) & near & keeps
     to_left = routes.lanes_to_go[lane, state.goal] < 0  # it wants to the right
     other, there = (jnp.where(to_left, x[lane], y[lane]) for x, y in zip(left, right, strict=True))
     goal = jnp.where(ends_well[lane], ahead[lane], other)
@@ -216,6 +218,9 @@ def _give_up(lane_map: LaneMap, state: State) -> State:
         state,
         goal=jnp.where(changes, goal, state.goal),
         status=state.status | jnp.where(changes, int(Status.MISSED_ROUTE), 0),
+        side=jnp.where(changes, 0, state.side),
+        progress=jnp.where(changes, 0, state.progress),
+        shift=jnp.where(changes, 0, state.shift),
     )
 
 

@@ -77,6 +77,15 @@ def test_width_and_margin_widen_the_stretch():
     assert entry["f_out"] == pytest.approx(23.0, abs=0.01)
 
 
+@pytest.mark.parametrize(("turn", "conflicts"), [(0.5, False), (1.0, False), (1.4, True), (-1.8, True)])
+def test_the_ends_of_a_body_swing_out_at_a_kink_into_the_next_lane(turn, conflicts):
+    """Two straight lanes 3 m apart; the next lane of one turns off on the spot."""
+    a = straight("a", (0.0, 0.0), 0.0, 20.0, junction="J", successors=("out",))
+    b = straight("b", (0.0, 3.0), 0.0, 20.0, junction="J")
+    out = straight("out", (20.0, 0.0), turn, 30.0)
+    assert (("a", "b") in entries(network([a, b, out]))) is conflicts
+
+
 def test_bridges_do_not_conflict():
     assert not entries(crossing(math.pi / 2, z=3.6))
     assert entries(crossing(math.pi / 2, z=3.4))

@@ -16,6 +16,7 @@ from limsim_jax.maps import read_network
 from limsim_jax.maps.bridges import LEAP, TIGHTEST
 from limsim_jax.maps.cut import without_gorges
 from limsim_jax.maps.network import Action, Control, MapError, Network
+from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import Round, default_goals
 
 FAULTS = SHARED / "map_faults"
@@ -228,10 +229,21 @@ def test_links_that_are_stated_stay_as_they_are(read):
 
 @pytest.mark.parametrize(
     ("turn", "away", "linked"),
-    [(0, 12, True), (90, 12, True), (-60, 12, True), (180, 12, True), (0, -12, False), (30, 200, False)],
+    [
+        (0, 12, True),
+        (90, 12, True),
+        (-60, 12, True),
+        (180, 12, True),
+        (0, -12, False),
+        (30, 200, False),
+        (180, 0, False),
+    ],
 )
 def test_bridges_that_can_be_steered(read, turn, away, linked):
-    """A road that goes on further, at an angle. One that begins behind the end of the other has no bridge."""
+    """A road that goes on further, at an angle.
+
+    One that begins behind the end of the other, or leads back beside it, has no bridge.
+    """
     angle = math.radians(turn)
     first = road(
         "1", [section(0, right=[lane(-1, links={"successor": -1})])], links=link("successor", "2", "start")
@@ -255,6 +267,31 @@ def test_bridges_that_can_be_steered(read, turn, away, linked):
             np.testing.assert_allclose(steps.sum(), x.length, rtol=2e-3)
             chord = np.arctan2(*np.diff(xyz[:, :2], axis=0).T[::-1])
             assert np.abs(np.angle(np.exp(1j * (chord - heading[:-1])))).max() < 0.1
+
+
+@pytest.mark.parametrize("at", [0.5, 0.3])
+def test_a_curve_that_turns_round_on_the_spot_is_cut(read, at):
+    """A reference line runs ahead and then back on itself: the lane beside it leaps to the other side."""
+    u = f'bU="120" cU="{-60 / at}"'
+    shape = f'<paramPoly3 aU="0" {u} dU="0" aV="0" bV="0" cV="0" dV="0" pRange="normalized"/>'
+    there, back = 60 * at, 60 * (1 - at) ** 2 / at
+    network = read(road("1", [section(0, right=[lane(-1)])], length=there + back, shape=shape))
+    first, second = network.lanes["1_0_-1"], network.lanes["1_1_-1"]
+    assert not first.successors and not second.predecessors
+    np.testing.assert_allclose([first.length, second.length], [there, back], atol=0.01)
+    np.testing.assert_allclose(first.xyz[-1, :2], [there, -1.75], atol=0.01)
+    np.testing.assert_allclose(second.xyz[0, :2], [there, 1.75], atol=0.01)
+    assert abs(math.remainder(second.heading[0] - math.pi, 2 * math.pi)) < 1e-6
+    (note,) = notes(network, "lane link")
+    assert note.action is Action.UNUSABLE
+
+
+@pytest.mark.parametrize(("away", "enters"), [(0.3, False), (1.5, False), (2.0, True), (6.0, True)])
+def test_no_vehicle_enters_where_it_would_lie_on_another_road(read, away, enters):
+    """A stub of 0.2 m that begins beside the end of another road."""
+    stub = road("2", [section(0, right=[lane(-1)])], length=0.2, x=100.5, y=away)
+    network = read(road("1", [section(0, right=[lane(-1)])]), stub)
+    assert set(origins(network)) == ({"1", "2"} if enters else {"1"})
 
 
 def test_numbers_off_by_one_link_lanes_that_begin_there(read):

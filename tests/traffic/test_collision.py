@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
+from synthetic import network, straight
 from traffic_worlds import bundled, state_of
 
 from limsim_jax.maps.lane_map import lane_rows, pose
+from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.traffic import collision, ego
 from limsim_jax.traffic.car_following import ballistic
 from limsim_jax.traffic.collision import OVERHANG, REACH, contacts
@@ -220,6 +222,24 @@ def test_traffic_that_keeps_to_lanes_is_off_the_road_where_no_lane_is_beside_it(
     state = dataclasses.replace(state, d=jnp.asarray(d), shape=shape, active=state.active.at[7].set(False))
     off = collision.off_road(lane_map, state, boxes(lane_map, state))
     np.testing.assert_array_equal(off, [False, False, True, False, False, False, False, False])
+
+
+def test_a_lane_change_may_end_where_the_road_enters_a_junction():
+    """Two lanes, of which the right one leads on: a body that comes over from the left one is on the road."""
+    beside = {"road": "p", "junction": None}
+    map_ = network([
+        straight("p0", (0.0, 0.0), 0.0, 40.0, successors=("c",), left="p1", **beside),
+        straight("p1", (0.0, 3.5), 0.0, 40.0, number=-2, right="p0", **beside),
+        straight("c", (40.0, 0.0), 0.0, 20.0, junction="J", successors=("out",)),
+        straight("out", (60.0, 0.0), 0.0, 50.0),
+    ])  # fmt: skip
+    rows, lane_map = lane_rows(map_), build_lane_map(map_)
+    state = state_of("ramp", [rows["c"]] * 4, [1.0, 8.0, 1.0, 1.0], [5.0] * 4, [0] * 4)
+    d = jnp.asarray([2.0, 2.0, -2.0, 5.0])
+    previous = jnp.full(4, rows["p0"])
+    state = dataclasses.replace(state, d=d, previous=previous)
+    off = collision.off_road(lane_map, state, boxes(lane_map, state))
+    np.testing.assert_array_equal(off, [False, True, True, True])
 
 
 def excess_of(network, points):

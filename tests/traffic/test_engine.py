@@ -355,11 +355,14 @@ def test_a_vehicle_before_a_short_wrong_lane_takes_another_goal():
         straight("left", (204.0, 3.5), 0.0, 50.0),
     ])  # fmt: skip
     rows, lane_map = lane_rows(map_), build_lane_map(map_, goals=[["left"], ["right"]])
-    s = [199.5, 180.0, 199.5, 1.0]
-    state = state_of("ramp", [rows["a"]] * 3 + [rows["p0"]], s, [0.0] * 4, [0] * 4)
-    waiting = jnp.asarray(
-        [DRIVING.patience + 1, DRIVING.patience + 1, DRIVING.patience - 1, DRIVING.patience + 1], jnp.float32
-    )
-    after = _give_up(lane_map, dataclasses.replace(state, waiting=waiting))
-    np.testing.assert_array_equal(after.goal, [1, 0, 0, 1])
-    np.testing.assert_array_equal((after.status & int(Status.MISSED_ROUTE)) > 0, [True, False, False, True])
+    s = [199.5, 180.0, 199.5, 1.0, 3.0, 3.0]
+    state = state_of("ramp", [rows["a"]] * 3 + [rows["p0"]] * 3, s, [0.0] * 6, [0] * 6)
+    # the last two have stopped while they change lanes; one of them has only just
+    long, short = DRIVING.patience + 1, DRIVING.patience - 1
+    waiting = jnp.asarray([long, long, short, long, long, short], jnp.float32)
+    side = jnp.asarray([0, 0, 0, 0, 1, 1])
+    after = _give_up(lane_map, dataclasses.replace(state, waiting=waiting, side=side))
+    gives_up = [True, False, False, True, True, False]
+    np.testing.assert_array_equal(after.goal, gives_up)
+    np.testing.assert_array_equal((after.status & int(Status.MISSED_ROUTE)) > 0, gives_up)
+    np.testing.assert_array_equal(after.side, [0, 0, 0, 0, 0, 1])

@@ -59,7 +59,7 @@ def build_conflicts(
     """
     lanes = connectors(network)
     index = {lane.id: k for k, lane in enumerate(lanes)}
-    overlaps = find_overlaps(lanes, vehicle_width, margin)
+    overlaps = find_overlaps(lanes, vehicle_width, margin, network.lanes)
     right_of_way = RightOfWay(network, lanes)
     equal = Decision(0, Rule.NONE, 0)
     decisions = [equal if o.type is ConflictType.SWEEP else right_of_way.decide(o) for o in overlaps]

@@ -34,6 +34,9 @@ SHARPEST = 1.9
 """Turn (rad) within `_BEND` above which a body swings round on the spot: a U-turn of 2.6 m radius."""
 
 _SWING = 1.8  # m, by which the corners of a car stand out more when it turns on the spot than along its way
+_KINK = 1.2  # rad, turn within `_SPOT`, also into the next lane, above which the ends of a body swing out ...
+_SPOT = 1.0  # m
+_KINK_SWING = 1.0  # m: ... as far as this
 _STEP = 0.25  # m, sampling of the centre lines
 _REACH = 200.0  # m, from a merge or split outside junctions, on which two lanes are compared
 _STEP_ASIDE = 8.0  # m at the end of a lane that jumps aside to another one
@@ -85,7 +88,9 @@ def connectors(network: Network) -> list[Lane]:
     return [lane for lane in lanes.values() if lane.junction is not None or lane.id in shared]
 
 
-def find_overlaps(lanes: Sequence[Lane], width: float, margin: float) -> list[Overlap]:
+def find_overlaps(
+    lanes: Sequence[Lane], width: float, margin: float, network: Mapping[str, Lane] | None = None
+) -> list[Overlap]:
     """All stretches on which two of these lanes come too close.
 
     Ends are exact to about 1 cm for paths that cross at more than 30 degrees. At flat angles the
@@ -95,15 +100,17 @@ def find_overlaps(lanes: Sequence[Lane], width: float, margin: float) -> list[Ov
         lanes: The lanes to compare, see `connectors`.
         width: Width of vehicles, m.
         margin: Free space that they need between them, m.
+        network: Lanes before and after these, by id: kinks between lanes count if they are known.
 
     Returns:
         Overlaps, each once; `first` and `second` are positions in `lanes`, first < second.
     """
     curves, reach = _Curves(lanes), width + margin
     regions = []
-    sharp = [curves.sharpest(a) > SHARPEST for a in range(len(curves.owner))]
-    for a, b in _candidates(lanes, curves, reach + _SWING if any(sharp) else reach):
-        regions.extend(curves.regions(a, b, reach + _SWING if sharp[a] or sharp[b] else reach))
+    around = {lane.id: lane for lane in lanes} if network is None else network
+    swing = [_swing(curves, a, lanes[k], around) for a, k in enumerate(curves.owner)]
+    for a, b in _candidates(lanes, curves, reach + max(swing, default=0.0)):
+        regions.extend(curves.regions(a, b, reach + max(swing[a], swing[b])))
     stretches = curves.refine(regions)
     overlaps = [
         Overlap(
@@ -119,6 +126,16 @@ def find_overlaps(lanes: Sequence[Lane], width: float, margin: float) -> list[Ov
     ]
     found = _classify(lanes, overlaps)
     return [*found, *_merges_with_a_jump(lanes, found), *_sweeps(lanes, curves, overlaps, width)]
+
+
+def _swing(curves: _Curves, a: int, lane: Lane, network: Mapping[str, Lane]) -> float:
+    """How far (m) the ends of a car stand out where it turns on the spot; 0 where it does not."""
+    if curves.sharpest(a, _BEND) > SHARPEST:
+        return _SWING
+    ahead = [network[name].heading[0] - lane.heading[-1] for name in lane.successors if name in network]
+    behind = [lane.heading[0] - network[name].heading[-1] for name in lane.predecessors if name in network]
+    kinks = [abs(math.remainder(turn, 2 * math.pi)) for turn in (*ahead, *behind)]
+    return _KINK_SWING if max([curves.sharpest(a, _SPOT), *kinks]) > _KINK else 0.0
 
 
 def _merges_with_a_jump(lanes: Sequence[Lane], overlaps: Sequence[Overlap]) -> Iterator[Overlap]:
@@ -293,10 +310,10 @@ class _Curves:
             distance[over] = np.inf
         return distance
 
-    def sharpest(self, a: int) -> float:
-        """Largest turn (rad) of a curve within `_BEND`."""
+    def sharpest(self, a: int, within: float) -> float:
+        """Largest turn (rad) of a curve within a stretch (m)."""
         s, heading = self.s[a], self.direction[a]
-        return float(np.abs(np.interp(s + _BEND, s, heading) - heading).max())
+        return float(np.abs(np.interp(s + within, s, heading) - heading).max())
 
     def refine(self, regions: Sequence[_Region]) -> Float[np.ndarray, "R 4"]:
         """s_in, s_out, f_in, f_out (m) of every region, interpolated between samples.

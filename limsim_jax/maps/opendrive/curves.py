@@ -86,6 +86,9 @@ class Geometry:
 _X, _W = np.polynomial.legendre.leggauss(16)
 _X, _W = (_X + 1) / 2, _W / 2
 
+_STOPS = 1e-3  # share of its mean speed, below which the point of a parametric curve stops
+_BESIDE = 1e-4  # m beside a cusp, where the direction is looked up
+
 
 class ReferenceLine:
     """The plan view of a road: position, heading and curvature at any `s`.
@@ -137,7 +140,8 @@ class ReferenceLine:
         for record, parametric in self._parametric.items():
             here = np.nonzero(i == record)[0]
             if here.size:
-                x[here], y[here], heading[here], curvature[here], rate[here] = parametric.frame(u[here])
+                found = parametric.frame(u[here], at[here] - self.s[record])
+                x[here], y[here], heading[here], curvature[here], rate[here] = found
         return x, y, heading, curvature, rate
 
     def curvature(self, s: Array, at: Array) -> Array:
@@ -147,8 +151,14 @@ class ReferenceLine:
         for record, parametric in self._parametric.items():
             here = np.nonzero(i == record)[0]
             if here.size:
-                curvature[here] = parametric.frame(s[here] - self.s[record])[3]
+                curvature[here] = parametric.frame(s[here] - self.s[record], at[here] - self.s[record])[3]
         return curvature
+
+    def cusps(self) -> Array:
+        """Where a curve turns round on the spot, s in m."""
+        return np.array(
+            [self.s[record] + x for record, curve in self._parametric.items() for x in curve.cusps]
+        )
 
     def stretch(self, at: Array) -> Array:
         """True length of the curve per metre of `s`: 1 except for parametric records."""
@@ -187,6 +197,18 @@ class _Parametric:
         self._arc = np.concatenate([[0.0], np.cumsum(self._measure(self._p[:-1], self._p[1:]))])
         total = self._arc[-1]
         self.stretch = total / geometry.length if total > 0 else 1.0
+        self.cusps = self._cusps()
+
+    def _cusps(self) -> Array:
+        """Where the curve stops and turns round, m from its start."""
+        du, dv = (np.polynomial.Polynomial(cubic).deriv() for cubic in (self._u, self._v))
+        speed2 = du**2 + dv**2
+        roots = np.asarray(speed2.deriv().roots())
+        p = np.unique(roots.real[np.abs(roots.imag) <= 1e-6 * np.abs(roots)])
+        p = p[(p > 0) & (p < self._p[-1])]
+        p = p[np.sqrt(np.maximum(speed2(p), 0)) < _STOPS * self._arc[-1] / self._p[-1]]
+        before = np.searchsorted(self._p, p, side="right") - 1
+        return (self._arc[before] + self._measure(self._p[before], p)) / self.stretch
 
     def _speed(self, p: Array) -> Array:
         return np.hypot(_derivative(self._u, p, 1), _derivative(self._v, p, 1))
@@ -207,7 +229,10 @@ class _Parametric:
                 break
         return p
 
-    def frame(self, s: Array) -> tuple[Array, Array, Array, Array, Array]:
+    def frame(self, s: Array, at: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """As that of the whole line, `s` and `at` from the start of the curve."""
+        for cusp in self.cusps:  # it has no direction there
+            s = np.where(at < cusp, np.minimum(s, cusp - _BESIDE), np.maximum(s, cusp + _BESIDE))
         arc = s * self.stretch
         p = np.interp(arc, self._arc, self._p)
         outside = np.where(arc > self._arc[-1], arc - self._arc[-1], np.minimum(arc, 0.0))

@@ -21,6 +21,7 @@ from limsim_jax.maps.opendrive.records import Mark, RawLane, RawRoad, RawSection
 MIN_SECTION = 1e-3  # m; a lane section shorter than this holds no traffic
 MIN_WIDTH = 0.05  # m; a lane that nowhere gets wider does not exist for its neighbours
 JUMP = 0.01  # m; where lane edges jump by more, the lane is cut
+FOLD = 0.5  # m; the same where the reference line turns on the spot, and lanes beside it leap
 _SHORTEST = 2e-3  # m; records that hold for less are rounding errors of the writer
 _HERMITE = 1e-5  # m, tolerated error of cubic Hermite interpolation between samples
 _LINEAR = 5e-4  # m, tolerated error of linear interpolation of widths between samples
@@ -148,7 +149,9 @@ class RoadShape:
         ]
         for lane in section.lanes.values():
             cubics += [(section.s, lane.width), (section.s, lane.border)]
-        found = [self.road.reference.s] + [s0 + c.s for s0, c in cubics if c is not None]
+        found = [self.road.reference.s, self.road.reference.cusps()] + [
+            s0 + c.s for s0, c in cubics if c is not None
+        ]
         knots = np.unique(np.concatenate(found))
         knots = knots[(knots > start + _SHORTEST) & (knots < end - _SHORTEST)]
         return knots[np.diff(knots, append=np.inf) > _SHORTEST]  # of records that close the last counts
@@ -247,9 +250,11 @@ class Cutter:
         after = shape.profile(section, knots, middle[1:])
         jump = np.max([np.abs(before[n][0][0] - after[n][0][0]) for n in before] or [np.zeros(len(knots))], 0)
         reference = shape.road.reference
-        x0, y0, *_ = reference.frame(knots, middle[:-1])
-        x1, y1, *_ = reference.frame(knots, middle[1:])
-        gap = np.hypot(x1 - x0, y1 - y0)
+        x0, y0, h0, *_ = reference.frame(knots, middle[:-1])
+        x1, y1, h1, *_ = reference.frame(knots, middle[1:])
+        aside = np.max([np.abs(after[n][0][0]) for n in after] or [np.zeros(len(knots))], 0)
+        fold = 2 * aside * np.abs(np.sin((h1 - h0) / 2))
+        gap = np.where(fold > FOLD, fold, np.hypot(x1 - x0, y1 - y0))
         for s, lateral, along in zip(knots, jump, gap, strict=True):
             if lateral > JUMP or along > JUMP:
                 self.report.approximated(
