@@ -1,1 +1,1 @@
-"""Worlds beside other simulators, in other libraries' shapes, and in other tools' formats."""
+"""Other simulators, other libraries' environments, other tools' formats."""

@@ -138,7 +138,7 @@ def _gap(before: Lane, after: Lane) -> float:
 
 
 def _turn(before: Lane, after: Lane) -> float:
-    """Angle (rad) between the end of a lane and the start of another."""
+    """Angle (rad) between the end of a lane and another."""
     return abs(math.remainder(after.heading[0] - before.heading[-1], 2 * math.pi))
 
 

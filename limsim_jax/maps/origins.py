@@ -41,7 +41,7 @@ def origins(network: Network) -> dict[str, tuple[str, ...]]:
 
 
 def _lies_on_others(network: Network, lane: Lane) -> bool:
-    """Whether a car at the start of a lane lies on a lane of another road behind it."""
+    """Whether a car at its start lies on another road."""
     if lane.length >= _CAR:
         return False
     back = np.arange(0.5, _CAR - lane.length, 0.5)

@@ -129,7 +129,9 @@ def find_overlaps(
 
 
 def _swing(curves: _Curves, a: int, lane: Lane, network: Mapping[str, Lane]) -> float:
-    """How far (m) the ends of a car stand out where it turns on the spot; 0 where it does not."""
+    """How far (m) a car turned on the spot stands out.
+
+    0 where it turns along its way."""
     if curves.sharpest(a, _BEND) > SHARPEST:
         return _SWING
     ahead = [network[name].heading[0] - lane.heading[-1] for name in lane.successors if name in network]

@@ -230,7 +230,7 @@ class _Parametric:
         return p
 
     def frame(self, s: Array, at: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """As that of the whole line, `s` and `at` from the start of the curve."""
+        """As `ReferenceLine.frame`, from the start of the curve."""
         for cusp in self.cusps:  # it has no direction there
             s = np.where(at < cusp, np.minimum(s, cusp - _BESIDE), np.maximum(s, cusp + _BESIDE))
         arc = s * self.stretch
