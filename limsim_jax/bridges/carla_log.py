@@ -132,7 +132,7 @@ class _Writer:
             here = np.flatnonzero(present[t])
             came, left = np.flatnonzero(present[t] & ~before), np.flatnonzero(before & ~present[t])
             packets = [
-                Packet(Kind.ADD, (*(self.lights if t == 0 else ()), *(self._actor(t, k) for k in came))),
+                Packet(Kind.ADD, (*(self.lights if t == 0 else ()), *(self._actor(t, int(k)) for k in came))),
                 _packet(Kind.DELETE, self.ids[left]),
                 _packet(Kind.PARENT, self.ids[:0]),
                 _packet(Kind.COLLISION, self.ids[:0]),

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from limsim_jax.api.world import World
 from limsim_jax.log_replay.replay import Replay
 from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, LaneMap, absolute, lane_ids
+from limsim_jax.maps.map import Map
 from limsim_jax.maps.network import Network, TrafficLight
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.recordings.carla_bodies import BODIES, Body
+from limsim_jax.recordings.carla_log import LIGHT_STATES
 from limsim_jax.simulation.trace import Trace
 
 FULL_STEER = 70.0
@@ -159,9 +161,22 @@ class Stage:
 
 def stage_of(world: World | Replay) -> Stage:
     """What CARLA shows of a world, or of a replay's first variant."""
-    replayed = isinstance(world, Replay)
-    seen = world.world() if isinstance(world, Replay) else world
-    trace, lanes, network = seen.trace, seen.map.lanes, seen.map.network
+    if isinstance(world, Replay):
+        shown = world.world()
+        return set_stage(shown.map, shown.trace, shown.ego, lights=False)
+    return set_stage(world.map, world.trace, world.ego)
+
+
+def set_stage(town: Map, trace: Trace, ego: int = -1, *, lights: bool = True) -> Stage:
+    """What CARLA shows of a trace.
+
+    Args:
+      town: where it happened.
+      trace: NumPy, `[T, ...]`.
+      ego: slot of the ego; -1: none beside those that a policy drives.
+      lights: whether the trace knows what the signals show; a log replay does not.
+    """
+    lanes, network = town.lanes, town.network
     active = np.asarray(trace.active, bool)
     slot = np.broadcast_to(np.arange(active.shape[1]), active.shape)
     # vehicles of the start have no number
@@ -173,7 +188,7 @@ def stage_of(world: World | Replay) -> Stage:
     order = np.argsort(first, kind="stable")  # as they come in
     rank = np.argsort(order)
     column = rank[column]
-    cast = tuple(_cast(trace, seen.ego, int(names[k]), int(t[first[k]]), int(n[first[k]])) for k in order)
+    cast = tuple(_cast(trace, ego, int(names[k]), int(t[first[k]]), int(n[first[k]])) for k in order)
     box = np.asarray(trace.box, np.float64)
     x, y = absolute(lanes, box[..., 0], box[..., 1])
     z, grade = _heights(network, trace)
@@ -184,12 +199,12 @@ def stage_of(world: World | Replay) -> Stage:
         return out
 
     height, grades = _filled(table(z)), _filled(table(grade))
-    lights, states = _lights(network, lanes, np.asarray(trace.phase))
+    signals, states = _lights(network, lanes, np.asarray(trace.phase))
     time = np.asarray(trace.time, np.float64)
     return Stage(
         time=np.round(time - time[0], 6), cast=cast, x=table(x), y=table(y), z=height,
         heading=table(box[..., 2]), pitch=np.arctan(grades), v=table(trace.v), a=table(trace.a),
-        lights=() if replayed else lights, states=states[:, :0] if replayed else states,
+        lights=signals if lights else (), states=states if lights else states[:, :0],
     )  # fmt: skip
 
 
@@ -240,21 +255,61 @@ def _lights(
     network: Network, lanes: LaneMap, phase: NDArray[Any]
 ) -> tuple[tuple[TrafficLight, ...], NDArray[np.int64]]:
     """Lights that govern a movement, and what they show."""
-    table = lanes.signals
-    program, link = np.asarray(table.movement_program), np.asarray(table.movement_link)
-    state = np.asarray(table.state)
-    found, shown = [], []
+    heads = signal_heads(network, lanes)
+    state = np.asarray(lanes.signals.state)
+    shown = [_STATE[state[head.program, phase[:, head.program], head.link]] for head in heads]
+    states = np.stack(shown, -1) if shown else np.zeros((len(phase), 0), np.int64)
+    return tuple(head.light for head in heads), states
+
+
+class Head(NamedTuple):
+    """A light, and which link of which signal program it shows."""
+
+    light: TrafficLight
+    program: int  # row of the signal table
+    link: int
+
+
+def signal_heads(network: Network, lanes: LaneMap) -> list[Head]:
+    """The lights that govern a movement with a program."""
+    program, link = (np.asarray(x) for x in (lanes.signals.movement_program, lanes.signals.movement_link))
+    heads = []
     for light in network.traffic_lights:
         governed = {spot.lane for spot in light.spots}
         for movement in network.movements:
             here = movement.incoming in governed or bool(governed.intersection(movement.via))
             meant = not light.turns or movement.turn in light.turns
             if here and meant and program[movement.index] >= 0:
-                row = int(program[movement.index])
-                found.append(light)
-                shown.append(_STATE[state[row, phase[:, row], link[movement.index]]])
+                heads.append(Head(light, int(program[movement.index]), int(link[movement.index])))
                 break
-    return tuple(found), np.stack(shown, -1) if shown else np.zeros((len(phase), 0), np.int64)
+    return heads
+
+
+def phases_like(
+    heads: Sequence[Head], lanes: LaneMap, shown: Mapping[str, str], phase: NDArray[Any]
+) -> NDArray[np.int32]:
+    """The phase of each program that is most like its lights.
+
+    Args:
+      heads: of the map, see `signal_heads`.
+      lanes: the map.
+      shown: names of `LIGHT_STATES` by the ids of lights.
+      phase: of now, `[P]`; it stays where no other one fits better.
+
+    Returns:
+      `[P]`.
+    """
+    table, count = np.asarray(lanes.signals.state), np.asarray(lanes.signals.num_phases)
+    found = np.array(phase, np.int32)
+    for row in {head.program for head in heads}:
+        own = [head for head in heads if head.program == row and head.light.id in shown]
+        fit = [
+            sum(LIGHT_STATES[_STATE[table[row, p, head.link]]] == shown[head.light.id] for head in own)
+            for p in range(int(count[row]))
+        ]
+        if own and max(fit) > fit[int(found[row])]:
+            found[row] = int(np.argmax(fit))
+    return found
 
 
 def nearest_light(lights: Sequence[TrafficLight], x: float, y: float) -> int | None:
@@ -279,4 +334,15 @@ def town_of(network: Network) -> str:
     return f"Town{found[1].upper()}{'_Opt' if found[2] else ''}"
 
 
-__all__ = ["NEAR", "Cast", "Stage", "nearest_light", "stage_of", "town_of"]
+__all__ = [
+    "NEAR",
+    "Cast",
+    "Head",
+    "Stage",
+    "nearest_light",
+    "phases_like",
+    "set_stage",
+    "signal_heads",
+    "stage_of",
+    "town_of",
+]

@@ -380,8 +380,10 @@ def _data(packet: Packet) -> bytes:
         case np.ndarray():
             records = np.ascontiguousarray(content, RECORDS[packet.kind])
             return _count(len(records)) + records.tobytes()
-        case _:
+        case tuple():
             return _count(len(content)) + b"".join(_encoded_actor(actor) for actor in content)
+        case _:
+            raise TypeError(f"packet {packet.kind}: {type(content).__name__} is no content of a packet")
 
 
 def _encoded_actor(actor: Actor) -> bytes:

@@ -198,7 +198,7 @@ def _rows(vehicle: _Vehicle, line: int, steps: np.ndarray, at: Floats, dt: float
         x=at[:, 0],
         y=at[:, 1],
         heading=(at[:, 3] + math.pi) % (2 * math.pi) - math.pi,
-        v=np.hypot(*velocity.T),
+        v=np.hypot(velocity[:, 0], velocity[:, 1]),
         length=np.full(count, vehicle.length),
         width=np.full(count, vehicle.width),
     )

@@ -4,6 +4,7 @@ import dataclasses
 import gzip
 import math
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -278,7 +279,7 @@ def test_what_a_log_of_the_server_adds(world, tmp_path):
     at, _ = to_carla(light.position[0] + 0.3, light.position[1], 7.0, 0.0)
     lamp = ActorType.TRAFFIC_LIGHT
     theirs = (
-        Actor(4, lamp, tuple(np.float32(at).tolist()), (0, 0, 0), 0, "traffic.traffic_light"),
+        Actor(4, lamp, tuple(at.tolist()), (0, 0, 0), 0, "traffic.traffic_light"),
         Actor(5, lamp, (9e6, 0, 0), (0, 0, 0), 0, "traffic.traffic_light"),
         Actor(2000, ActorType.VEHICLE, (0, 0, 0), (0, 0, 0), 31, "vehicle.audi.tt"),
         Actor(2001, ActorType.VEHICLE, (0, 0, 0), (0, 0, 0), 12, "vehicle.yamaha.yzf"),
@@ -289,7 +290,9 @@ def test_what_a_log_of_the_server_adds(world, tmp_path):
     found = parse(path.read_bytes())
     assert (found["map"], found["date"]) == ("Town99", 8)
     added = [a for frame in found["frames"] for a in frame["add"]]
-    assert [(a[0], a[2][:3]) for a in added if a[1] == 3] == [(4, pytest.approx(theirs[0].location))]
+    assert [(a[0], a[2][:3]) for a in added if a[1] == 3] == [
+        (4, pytest.approx(theirs[0].location, rel=1e-6))
+    ]
     vehicles = [a for a in added if a[1] == 1]
     assert min(a[0] for a in vehicles) > 2001
     assert {(a[3], a[4]) for a in vehicles} == {(31, "vehicle.audi.tt"), (12, "vehicle.yamaha.yzf")}
@@ -386,14 +389,14 @@ def test_a_world_comes_back_as_a_scene(world, crossing, tmp_path):
     assert tracks.v[3, hero] == pytest.approx(9.0, abs=0.05)
 
 
-def moved_log(places: list[tuple[float, float, float] | None], dt: float = 0.05) -> CarlaLog:
+def moved_log(places: Sequence[tuple[float, ...] | None], dt: float = 0.05) -> CarlaLog:
     """A car at places (m, ours), frame by frame; None: it is not there."""
     car = Actor(9, ActorType.VEHICLE, (0, 0, 0), (0, 0, 0), 26, "vehicle.audi.tt")
     frames = []
     for k, place in enumerate(places):
         rows = np.zeros(0 if place is None else 1, RECORDS[Kind.POSITION])
         if place is not None:
-            rows["id"], (rows["location"], _) = 9, to_carla(*place, 0.0)
+            rows["id"], rows["location"] = 9, to_carla(place[0], place[1], place[2], 0.0)[0]
         packets = [Packet(Kind.ADD, (car,))] if k == 0 else []
         frames.append(Frame(k + 1, dt, k * dt, (*packets, Packet(Kind.POSITION, rows))))
     return CarlaLog(map="T", date=0, frames=tuple(frames))
