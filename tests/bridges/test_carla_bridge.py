@@ -355,18 +355,16 @@ def test_a_stage_of_nothing(crossing, world):
     assert stage.cast == () and stage.x.shape == (len(empty.time), 0)
 
 
-# --- experiments and environments, step by step -----------------------------------------------------------------
+# --- experiments and environments, step by step -----------------------------------------------------------
 
 
 @pytest.mark.engine
 def test_an_experiment_beside_carla(carla, crossing, their_town):
-    """Our traffic appears in CARLA; a hero of CARLA is the ego, which our traffic sees; lights are CARLA's."""
+    """Our traffic appears in CARLA; the ego is a hero of CARLA, and lights are CARLA's."""
     import limsim_jax as lj
     from limsim_jax.bridges.carla_live import EnvShow, Live
 
-    experiment = lj.Experiment(
-        "intersection", ego=lj.Ego(lane="1_0_-1", position=30.0), density=8.0, horizon=20.0, slots=24
-    )
+    experiment = lj.Experiment("intersection", horizon=20.0)
     double = Double(their_town, carla)
     with CarlaServer(crossing, client=double, dt=experiment.file.dt) as server:
         live = Live(experiment, server, hero="hero", lights="carla")
