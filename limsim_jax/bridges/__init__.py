@@ -1,1 +1,5 @@
-"""Worlds beside other simulators, in other libraries' shapes, and in other tools' formats."""
+"""Worlds beside other simulators, in other libraries' shapes and formats."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, submodules=["carla"])

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from limsim_jax.api.env import Env, EnvState
 from limsim_jax.api.experiment import Experiment
-from limsim_jax.bridges.carla import Backend, CarlaError, Foreign, Show, check_step
-from limsim_jax.bridges.carla_stage import Stage, phases_like, set_stage, signal_heads
+from limsim_jax.bridges.carla_server import Backend, CarlaError, Foreign, Show, check_step
+from limsim_jax.bridges.carla_stage import Stage, lanes_showing, set_stage, signal_heads
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, project, relative
 from limsim_jax.policies.base import PolicyLike
 from limsim_jax.simulation.rollout import Rollout, started
@@ -72,6 +72,7 @@ class Live:
         self.backend, self.hero, self.lights = backend, hero, lights
         episodes = self.experiment.episodes(_Rolling() if hero is not None else policy, chunk=1)
         self.town, self.lanes = episodes.town, episodes.lane_map
+        self._own_lanes = self.lanes
         run: Rollout = replace(episodes.rollout, record=trace, measure=None)
         self.config = run.config
         begun = started(run, self.lanes, episodes.sample, seed)
@@ -89,6 +90,11 @@ class Live:
         return self._carry.state
 
     @property
+    def ego(self) -> int | None:
+        """Number of the first ego in CARLA, None without one."""
+        return None if self._ego < 0 else -1 - self._ego
+
+    @property
     def time(self) -> float:
         """s since the start."""
         return float(self.config.time(self.state.step))
@@ -101,13 +107,13 @@ class Live:
         """
         state = self.state
         if self.lights == "carla":
-            state = self._with_lights(state)
+            self.lanes = lanes_showing(self._own_lanes, self._heads, self._shown())
         if self.hero is not None:
             state = place_ego(self.lanes, state, self._foreign_hero())
         self._carry = self._carry._replace(state=state)
         result, self._carry = self._advance(self.lanes, self._schedule, self._key, self._carry)
-        shown: Trace = jax.device_get(result.records)
-        stage = set_stage(self.town, shown, self._ego)
+        shown: Trace = jax.device_get(result.trace)
+        stage = set_stage(self.town, shown, self._ego, lanes=self.lanes)
         for t in range(len(stage.time)):
             self._show.moment(stage, t)
         return stage
@@ -126,13 +132,9 @@ class Live:
             )
         return found[0]
 
-    def _with_lights(self, state: State) -> State:
+    def _shown(self) -> dict[str, str]:
         lights = [head.light for head in self._heads]
-        shown = self.backend.read_lights(lights)  # pyright: ignore[reportAttributeAccessIssue]
-        now = np.asarray(state.lights.phase)
-        phase = phases_like(self._heads, self.lanes, shown, now)
-        elapsed = jnp.zeros_like(state.lights.elapsed)  # CARLA says when it ends
-        return replace(state, lights=replace(state.lights, phase=jnp.asarray(phase), elapsed=elapsed))
+        return self.backend.read_lights(lights)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def place_ego(lanes: LaneMap, state: State, vehicle: Foreign) -> State:

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +24,6 @@ from limsim_jax.maps.map import Map
 from limsim_jax.maps.network import Network, TrafficLight
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.recordings.carla_bodies import BODIES, Body
-from limsim_jax.recordings.carla_log import LIGHT_STATES
 from limsim_jax.simulation.trace import Trace
 
 FULL_STEER = 70.0
@@ -167,7 +167,9 @@ def stage_of(world: World | Replay) -> Stage:
     return set_stage(world.map, world.trace, world.ego)
 
 
-def set_stage(town: Map, trace: Trace, ego: int = -1, *, lights: bool = True) -> Stage:
+def set_stage(
+    town: Map, trace: Trace, ego: int = -1, *, lights: bool = True, lanes: LaneMap | None = None
+) -> Stage:
     """What CARLA shows of a trace.
 
     Args:
@@ -175,8 +177,9 @@ def set_stage(town: Map, trace: Trace, ego: int = -1, *, lights: bool = True) ->
       trace: NumPy, `[T, ...]`.
       ego: slot of the ego; -1: none beside those that a policy drives.
       lights: whether the trace knows what the signals show; a log replay does not.
+      lanes: of the world, with its signals; None: those of the map.
     """
-    lanes, network = town.lanes, town.network
+    lanes, network = town.lanes if lanes is None else lanes, town.network
     active = np.asarray(trace.active, bool)
     slot = np.broadcast_to(np.arange(active.shape[1]), active.shape)
     # vehicles of the start have no number
@@ -257,17 +260,17 @@ def _lights(
     """Lights that govern a movement, and what they show."""
     heads = signal_heads(network, lanes)
     state = np.asarray(lanes.signals.state)
-    shown = [_STATE[state[head.program, phase[:, head.program], head.link]] for head in heads]
+    shown = [_STATE[state[head.program, phase[:, head.program], head.links[0]]] for head in heads]
     states = np.stack(shown, -1) if shown else np.zeros((len(phase), 0), np.int64)
     return tuple(head.light for head in heads), states
 
 
 class Head(NamedTuple):
-    """A light, and which link of which signal program it shows."""
+    """A light, and which links of which signal program it shows."""
 
     light: TrafficLight
     program: int  # row of the signal table
-    link: int
+    links: tuple[int, ...]
 
 
 def signal_heads(network: Network, lanes: LaneMap) -> list[Head]:
@@ -276,40 +279,47 @@ def signal_heads(network: Network, lanes: LaneMap) -> list[Head]:
     heads = []
     for light in network.traffic_lights:
         governed = {spot.lane for spot in light.spots}
-        for movement in network.movements:
-            here = movement.incoming in governed or bool(governed.intersection(movement.via))
-            meant = not light.turns or movement.turn in light.turns
-            if here and meant and program[movement.index] >= 0:
-                heads.append(Head(light, int(program[movement.index]), int(link[movement.index])))
-                break
+        meant = [
+            movement.index
+            for movement in network.movements
+            if (movement.incoming in governed or governed.intersection(movement.via))
+            and (not light.turns or movement.turn in light.turns)
+            and program[movement.index] >= 0
+        ]
+        if meant:
+            row = int(program[meant[0]])
+            links = dict.fromkeys(int(link[k]) for k in meant if program[k] == row)
+            heads.append(Head(light, row, tuple(links)))
     return heads
 
 
-def phases_like(
-    heads: Sequence[Head], lanes: LaneMap, shown: Mapping[str, str], phase: NDArray[Any]
-) -> NDArray[np.int32]:
-    """The phase of each program that is most like its lights.
+def lanes_showing(lanes: LaneMap, heads: Sequence[Head], shown: Mapping[str, str]) -> LaneMap:
+    """The map whose lights show what lights elsewhere show.
 
     Args:
-      heads: of the map, see `signal_heads`.
       lanes: the map.
-      shown: names of `LIGHT_STATES` by the ids of lights.
-      phase: of now, `[P]`; it stays where no other one fits better.
-
-    Returns:
-      `[P]`.
+      heads: of the map, see `signal_heads`.
+      shown: names of `LIGHT_STATES` by the ids of lights; links of others and of unknown lights keep to their
+        programs.
     """
-    table, count = np.asarray(lanes.signals.state), np.asarray(lanes.signals.num_phases)
-    found = np.array(phase, np.int32)
-    for row in {head.program for head in heads}:
-        own = [head for head in heads if head.program == row and head.light.id in shown]
-        fit = [
-            sum(LIGHT_STATES[_STATE[table[row, p, head.link]]] == shown[head.light.id] for head in own)
-            for p in range(int(count[row]))
-        ]
-        if own and max(fit) > fit[int(found[row])]:
-            found[row] = int(np.argmax(fit))
-    return found
+    table = lanes.signals
+    state = np.array(table.state)
+    for head in heads:
+        name = shown.get(head.light.id, "unknown")
+        for link in head.links if name in _MEANT else ():
+            go = state[head.program, :, link]
+            yields = not (go == SignalState.GREEN_MAJOR).any()
+            green = SignalState.GREEN_MINOR if yields else SignalState.GREEN_MAJOR
+            state[head.program, :, link] = green if name == "green" else _MEANT[name]
+    return replace(lanes, signals=replace(table, state=jnp.asarray(state, jnp.asarray(table.state).dtype)))
+
+
+_MEANT = {
+    "red": SignalState.RED,
+    "yellow": SignalState.YELLOW,
+    "green": SignalState.GREEN_MAJOR,
+    "off": SignalState.OFF_BLINKING,  # vehicles yield
+}
 
 
 def nearest_light(lights: Sequence[TrafficLight], x: float, y: float) -> int | None:
@@ -339,8 +349,8 @@ __all__ = [
     "Cast",
     "Head",
     "Stage",
+    "lanes_showing",
     "nearest_light",
-    "phases_like",
     "set_stage",
     "signal_heads",
     "stage_of",

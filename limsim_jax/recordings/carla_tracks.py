@@ -25,6 +25,9 @@ STEP = 0.025
 
 With it, the straight line between two steps is within 2 mm of the way at 20 m/s^2."""
 
+HERO = "hero"
+"""Role of the vehicle under test in CARLA, and its name here if there is one only; others have their ids."""
+
 EVEN = 1e-3
 """s by which the frames of a log with a fixed step may be off."""
 
@@ -108,11 +111,16 @@ def _step(time: Floats) -> float:
     return step if even and _STEPS[0] <= step <= _STEPS[1] else STEP
 
 
+def _is_hero(actor: Actor) -> bool:
+    return actor.type == ActorType.VEHICLE and actor.attribute("role_name") == HERO
+
+
 def _pieces(path: Path, log: CarlaLog, time: Floats) -> Iterator[tuple[_Vehicle, NDArray[Any], Floats]]:
     """Stretches of vehicles: numbers of frames, and x, y, z (m) and heading (rad, no jumps).
 
     A stretch ends where its vehicle leaves or is put elsewhere. An id may be given to another actor later.
     """
+    heroes = {actor.id for actor in log.actors() if _is_hero(actor)}
     present: dict[int, tuple[_Vehicle, list[int], list[Any]]] = {}
     found: list[tuple[_Vehicle, list[int], list[Any]]] = []
     for k, frame in enumerate(log.frames):
@@ -121,7 +129,8 @@ def _pieces(path: Path, log: CarlaLog, time: Floats) -> Iterator[tuple[_Vehicle,
         for actor in frame.added:
             present.pop(actor.id, None)
             if actor.type == ActorType.VEHICLE:
-                present[actor.id] = (_Vehicle.of(actor, frame), [], [])
+                name = HERO if _is_hero(actor) and len(heroes) == 1 else str(actor.id)
+                present[actor.id] = (_Vehicle.of(actor, frame, name), [], [])
                 found.append(present[actor.id])
         positions = frame.records(Kind.POSITION)
         for n in np.flatnonzero(np.isin(positions["id"], list(present))).tolist():
@@ -176,9 +185,8 @@ class _Vehicle:
     ahead: float  # middle of the body ahead of the actor's origin
 
     @classmethod
-    def of(cls, actor: Actor, frame: Frame) -> _Vehicle:
+    def of(cls, actor: Actor, frame: Frame, name: str) -> _Vehicle:
         """The vehicle of an actor, sized by box or blueprint."""
-        name = "hero" if actor.attribute("role_name") == "hero" else str(actor.id)
         boxes = frame.records(Kind.BOX)
         for box in boxes[boxes["id"] == actor.id][:1]:
             if np.isfinite([*box["origin"], *box["extent"]]).all() and (box["extent"] > 0).all():
