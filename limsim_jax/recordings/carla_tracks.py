@@ -32,6 +32,7 @@ EVEN = 1e-3
 """s by which the frames of a log with a fixed step may be off."""
 
 _STEPS = (0.02, 0.5)  # s, a log with a fixed step within these keeps it
+_LONGEST = 100_000  # steps
 _JUMP = 2.0  # m farther than its speed allows: the vehicle was put elsewhere
 _LEVEL = 3.0  # m above or below the lane at which a vehicle is not on the road: CARLA parks some under it
 _NEAR = 8.0  # m from the middle of a lane that is still the road
@@ -59,7 +60,10 @@ def read_carla_tracks(path: Path, data: bytes, network: Network, dt: float | Non
     dt = _step(time) if dt is None else dt
     if not 0 < dt <= 1:
         raise RecordingError(f"{path}: dt: {dt:g} s; more than 0 and at most 1 is expected")
-    moments = np.arange(math.floor((time[-1] - time[0]) / dt + 1e-6) + 1)
+    if (time[-1] - time[0]) / dt > _LONGEST:
+        raise RecordingError(
+            f"{path}: lasts {time[-1] - time[0]:g} s; at most {_LONGEST:,} steps of {dt:g} s are expected"
+        )
     roads = _Roads(network)
     rows: list[Rows] = []
     fits = []
@@ -67,7 +71,7 @@ def read_carla_tracks(path: Path, data: bytes, network: Network, dt: float | Non
         t = time[frames] - time[0]
         if len(t) < 2:
             continue
-        steps = moments[(moments * dt >= t[0] - 1e-9) & (moments * dt <= t[-1] + 1e-9)]
+        steps = np.arange(math.ceil(t[0] / dt - 1e-6), math.floor(t[-1] / dt + 1e-6) + 1)
         if len(steps) < 2:
             continue
         at = np.stack([np.interp(steps * dt, t, column) for column in places.T], -1)

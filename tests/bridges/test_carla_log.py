@@ -423,6 +423,9 @@ def test_a_car_that_is_put_elsewhere_is_another_one(tmp_path):
     save_log(tmp_path / "m.log", moved_log([(0.0, 0.0, 0.0)] * 3, dt=0.0))
     with pytest.raises(RecordingError, match="frame 2: 0 s elapsed; seconds that grow"):
         read_tracks(tmp_path / "m.log", network=town.network)
+    save_log(tmp_path / "m.log", moved_log([(0.0, 0.0, 0.0)] * 3, dt=1e12))
+    with pytest.raises(RecordingError, match="lasts 2e\\+12 s; at most 100,000 steps"):
+        read_tracks(tmp_path / "m.log", network=town.network)
 
 
 # --- the lane check -----------------------------------------------------------------------------------------
@@ -460,6 +463,24 @@ def assert_on_lanes(town_file):
 
 def test_a_world_lies_on_carlas_lanes():
     assert_on_lanes(REPO / "maps" / "intersection.xodr")
+
+
+@needs_shared
+def test_heights_and_slopes_are_those_of_carlas_road():
+    carla = pytest.importorskip("carla")
+    file = SHARED / "opendrive" / "curves_elevation.xodr"
+    town = load_map(file)
+    frames = parse(carla_log(lane_world(town, vehicles=2, seconds=12.0, speed=20.0)).to_bytes())["frames"]
+    theirs, heights, slopes = carla.Map("hills", file.read_text()), [], []
+    for frame in frames[::4]:
+        for _, x, y, z, roll, pitch, _ in frame["positions"]:
+            spot = carla.Location(x=x / 100, y=y / 100, z=z / 100)
+            road = theirs.get_waypoint(spot, lane_type=carla.LaneType.Any).transform
+            assert abs(road.location.z - z / 100) < 0.02 and roll == 0
+            assert abs((road.rotation.pitch - pitch + 180) % 360 - 180) < 0.1
+            heights.append(z / 100)
+            slopes.append(pitch)
+    assert np.ptp(heights) > 5 and np.ptp(slopes) > 4
 
 
 @pytest.mark.slow
