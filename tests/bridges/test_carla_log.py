@@ -477,7 +477,7 @@ def test_heights_and_slopes_are_those_of_carlas_road():
             spot = carla.Location(x=x / 100, y=y / 100, z=z / 100)
             road = theirs.get_waypoint(spot, lane_type=carla.LaneType.Any).transform
             assert abs(road.location.z - z / 100) < 0.02 and roll == 0
-            assert abs((road.rotation.pitch - pitch + 180) % 360 - 180) < 0.1
+            assert abs((road.rotation.pitch - pitch + 180) % 360 - 180) < 0.3  # over 2 m, and at a point
             heights.append(z / 100)
             slopes.append(pitch)
     assert np.ptp(heights) > 5 and np.ptp(slopes) > 4
