@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ Lights = Literal["ours", "carla"]
 class Live:
     """An experiment beside CARLA, or beside a stand-in for it.
 
-        experiment = lj.Experiment("Town05.xodr", flows=[lj.Flow(rate=400)])
+        experiment = lj.Experiment(map="Town05.xodr", ego=lj.Ego(), flows=[lj.Flow(rate=400)])
         with CarlaServer(experiment.map, dt=0.1) as server:
             live = Live(experiment, server, policy=lj.PDMClosed())
             for _ in range(100):
@@ -45,12 +45,13 @@ class Live:
       backend: a `CarlaServer` whose `dt` is the step of the experiment, or a stand-in.
       policy: drives the egos; None: that of the experiment.
       seed: of the world.
-      hero: role name of a vehicle of CARLA that is our first ego; None: our egos are ours.
-      lights: whose traffic lights count; of "carla", our programs show what CARLA's lights show.
+      hero: role name of a vehicle of CARLA that is our first ego; None: our egos are ours. It is read at each
+        decision and rolls on straight in between.
+      lights: whose traffic lights count; of "carla", our lights show what CARLA's show.
 
     Raises:
       ExperimentError: an experiment that cannot run.
-      ValueError: a step that differs from the server's, a hero with a policy or without an ego.
+      ValueError: a step that differs from the server's, a hero with a policy or without an ego, other lights.
     """
 
     def __init__(
@@ -68,6 +69,8 @@ class Live:
             raise ValueError(f"hero, policy: '{hero}' drives in CARLA; one of them is expected")
         if hero is not None and not self.experiment.file.ego:
             raise ValueError(f"hero: experiment '{self.experiment.name}' has no ego that it could be")
+        if lights not in get_args(Lights):
+            raise ValueError(f"lights: '{lights}'; known are {', '.join(get_args(Lights))}")
         check_step(backend, self.experiment.file.dt)
         self.backend, self.hero, self.lights = backend, hero, lights
         episodes = self.experiment.episodes(_Rolling() if hero is not None else policy, chunk=1)

@@ -365,8 +365,16 @@ def test_a_recorded_car_is_within_a_centimetre_of_its_log():
     expected = [np.interp(table["time"], time, place[:, axis]) for axis in (0, 1)]
     assert np.hypot(table["x"] - expected[0], table["y"] - expected[1]).max() < 0.01
     assert len(table) > 450 and table["lane"].notna().all()
-    braked = scene.replay(ego="hero", braking=4.0, start=8.0).trajectories().to_pandas()
+    run = scene.replay(ego="hero", braking=4.0, start=8.0)
+    braked = run.trajectories().to_pandas()
     assert braked["v"].iloc[-1] < 1.0 < table["v"].iloc[-1]
+    # and back again, with what the log of the server knows of it
+    log = parse(carla_log(run, like=REAL).to_bytes())
+    (car,) = [a for frame in log["frames"] for a in frame["add"]]
+    assert log["map"] == "Town01" and car[3:5] == (26, "vehicle.lincoln.mkz_2017")
+    assert car[5]["role_name"] == "hero"
+    places = np.array([frame["positions"][0][1:3] for frame in log["frames"]]) / 100 * [1, -1]
+    assert np.hypot(*(places - braked[["x", "y"]].to_numpy()).T).max() < 0.005  # 4 mm behind the middle
 
 
 def test_a_world_comes_back_as_a_scene(world, crossing, tmp_path):
