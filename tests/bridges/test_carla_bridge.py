@@ -171,8 +171,10 @@ def test_vehicles_of_others_are_seen_and_left_alone(make, world, carla):
     hero = double.add(Actor(double, 7, "vehicle.tesla.model3", place, "hero"))
     hero.velocity = carla.Vector3D(3.0, 4.0, 0.0)
     with server:
-        play(world, server)
-        (found,) = server.foreign()
+        shown = []
+        play(world, server, on_tick=lambda *_: shown.append((len(double.vehicles), server.foreign())))
+    assert min(count for count, _ in shown) > 3 and all(len(others) == 1 for _, others in shown)
+    (found,) = shown[-1][1]
     assert (found.id, found.blueprint, found.role, found.v) == (7, "vehicle.tesla.model3", "hero", 5.0)
     assert found.pose.heading == pytest.approx(math.pi / 2)
     assert (found.pose.x, found.pose.y) == pytest.approx((5.0, 7.1), abs=1e-6)  # its box is 0.1 m ahead
