@@ -18,7 +18,8 @@ from limsim_jax.log_replay.arrays import SceneArrays, build_arrays
 from limsim_jax.log_replay.pilot import PolicyPilot
 from limsim_jax.log_replay.replay import Replay
 from limsim_jax.log_replay.takeover import Ego, Moment, Record, Takeover, braking, replay, replay_many
-from limsim_jax.maps.map import Map
+from limsim_jax.maps.map import Map, load_map
+from limsim_jax.maps.network import Network
 from limsim_jax.policies.base import Policy
 from limsim_jax.recordings import Tracks, read_tracks
 from limsim_jax.recordings.lanelets import SPEED_LIMIT
@@ -177,22 +178,29 @@ def load_scene(
     path: str | Path,
     scenario: str | None = None,
     *,
+    map: str | Path | Network | Map | None = None,
     span: tuple[float, float] | None = None,
     speed_limit: float = SPEED_LIMIT,
+    dt: float | None = None,
 ) -> Scene:
     """Read a recorded scene: vehicles and the lanes that they drove on.
 
     Args:
-      path: a CommonRoad XML file, the table `scenes_vehicles.csv` with those of its lanelets beside it, or an
-        OpenACC platoon; also gzipped.
+      path: a CommonRoad XML file, the table `scenes_vehicles.csv` with those of its lanelets beside it, an
+        OpenACC platoon, or a recorder log of CARLA; also gzipped.
       scenario: which one of the table; not needed if it has only one.
+      map: of a log of CARLA: that of its town, as for `load_map`.
       span: s, begin and end of the stretch of an OpenACC recording, see `recordings.read_tracks`.
       speed_limit: m/s, of the lanes: no recording tells it for all of them.
+      dt: s per step, of a log of CARLA; None: as in the log, or 0.025 s if its frames are not evenly spaced.
 
     Raises:
       RecordingError: one line that names file, line and column or element, and what is expected.
+      MapError: the map cannot be read.
     """
-    return Scene(read_tracks(path, scenario, span=span, speed_limit=speed_limit))
+    network = None if map is None else load_map(map).network
+    options = {"span": span, "speed_limit": speed_limit, "network": network, "dt": dt}
+    return Scene(read_tracks(path, scenario, **options))
 
 
 @jax.jit

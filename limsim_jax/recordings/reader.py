@@ -14,7 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from limsim_jax.maps.network import MapError
+from limsim_jax.maps.network import MapError, Network
+from limsim_jax.recordings.carla_log import is_carla_log, parse_log
+from limsim_jax.recordings.carla_tracks import read_carla_tracks
 from limsim_jax.recordings.checks import TOLERATED, checked
 from limsim_jax.recordings.columns import example, has_fields, read_columns
 from limsim_jax.recordings.commonroad import read_commonroad, read_commonroad_tracks
@@ -54,6 +56,10 @@ def read_recording(path: str | Path, *, tolerated: float = TOLERATED) -> Recordi
     """
     path = Path(path)
     data = read_bytes(path)
+    if is_carla_log(data):
+        raise RecordingError(
+            f"{path}: is a recorder log of CARLA; `load_scene` replays it on the map of its town"
+        )
     if _is_xml(data):
         try:
             return checked(read_commonroad(path, data), tolerated)
@@ -129,21 +135,35 @@ def read_tracks(
     *,
     span: tuple[float, float] | None = None,
     speed_limit: float = SPEED_LIMIT,
+    network: Network | None = None,
+    dt: float | None = None,
 ) -> Tracks:
     """Read the tracks of a recorded scene with its lanes.
 
     Args:
-      path: a CommonRoad XML file, the table `scenes_vehicles.csv`, or an OpenACC platoon; also gzipped.
+      path: a CommonRoad XML file, the table `scenes_vehicles.csv`, an OpenACC platoon, or a recorder log of
+        CARLA; also gzipped.
       scenario: which one of the table; not needed if it has only one.
       span: s, begin and end of the stretch of an OpenACC recording: one in which no car comes by the same
         place twice. Other recordings are read whole.
       speed_limit: m/s, of the lanes: no recording tells it for all of them.
+      network: of the town, for a log of CARLA, and for no other.
+      dt: s per step, of a log of CARLA; None: as in the log, or 0.025 s if its frames are not evenly spaced.
 
     Raises:
       RecordingError: one line that names file, line and column or element, and what is expected.
     """
     path = Path(path)
     data = read_bytes(path)
+    if is_carla_log(data):
+        if network is None:
+            town = parse_log(path, data).map
+            raise RecordingError(f"{path}: map: was recorded in {town}; its OpenDRIVE file is expected")
+        if span is not None or scenario is not None:
+            raise RecordingError(f"{path}: a log of CARLA has neither `scenario` nor `span`")
+        return read_carla_tracks(path, data, network, dt)
+    if network is not None or dt is not None:
+        raise RecordingError(f"{path}: map, dt: expected of a log of CARLA, and of no other recording")
     platoon = not _is_xml(data) and header_of(data)[0] in ("Date", "Vehicle_order")
     if platoon != (span is not None):
         raise RecordingError(
