@@ -38,7 +38,9 @@ PIXEL = 0.25
 """Side of a pixel of the ground, m."""
 
 TILE = 64
-"""Pixels along the side of a tile."""
+"""Pixels along the side of a tile, a power of two."""
+
+_BITS = TILE.bit_length() - 1
 
 MARK_WIDTH = 0.15
 """Lane marks, m (RMS 1993: 0.12 to 0.15); at least a pixel is painted."""
@@ -136,8 +138,8 @@ def ground(scenery: Scenery, x: Float[Array, "*b"], y: Float[Array, "*b"]) -> UI
     # beyond the raster all is open country, as in its outermost tiles
     i = jnp.clip(jnp.floor((x - scenery.corner[0]) * size), 0, columns * TILE - 1).astype(jnp.int32)
     j = jnp.clip(jnp.floor((y - scenery.corner[1]) * size), 0, rows * TILE - 1).astype(jnp.int32)
-    tile = scenery.tile.reshape(-1).at[(j // TILE) * columns + i // TILE].get(mode="promise_in_bounds")
-    place = (tile * TILE + j % TILE) * TILE + i % TILE
+    tile = scenery.tile.reshape(-1).at[(j >> _BITS) * columns + (i >> _BITS)].get(mode="promise_in_bounds")
+    place = (((tile << _BITS) + (j & (TILE - 1))) << _BITS) + (i & (TILE - 1))
     return scenery.paint.reshape(-1).at[place].get(mode="promise_in_bounds")
 
 
@@ -305,7 +307,7 @@ class _Canvas:
         if tile is None:
             if len(self.painted) >= MOST_TILES:
                 raise MapError(
-                    f"more than {MOST_TILES} tiles of ground at {self.pixel:g} m per pixel; use a larger pixel",
+                    f"more than {MOST_TILES} tiles of ground; use a pixel above {self.pixel:g} m",
                     file=self.source,
                 )
             tile = self.painted[x, y] = np.full((TILE, TILE), Label.TERRAIN, np.uint8)
@@ -352,7 +354,9 @@ def _lights(network: Network, lane_map: LaneMap) -> tuple[Floats, list[int]]:
         groups: dict[bytes, int] = {}
         for k in np.argsort([-math.atan2(way @ left, way @ ahead) for way in ways]):
             other = rows[after[k]]
-            groups.setdefault(state[program[other], :, link[other]].tobytes() + bytes([program[other] % 256]), other)
+            groups.setdefault(
+                state[program[other], :, link[other]].tobytes() + bytes([program[other] % 256]), other
+            )
         for k, other in enumerate(groups.values()):
             beside = ((len(groups) - 1) / 2 - k) * 2 * LIGHT_SIZE[1]
             x, y = xyz[:2] + LIGHT_AHEAD * ahead + beside * left - np.asarray(lane_map.origin, float)
