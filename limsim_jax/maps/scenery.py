@@ -54,6 +54,9 @@ DASH = {"town": 6.0, "motorway": 12.0}
 HOLE = 40.0
 """Gaps between the lanes of a junction up to this area are paved, m^2. Chosen: below a small island."""
 
+SLIVER = 1.0
+"""Gaps between them that are narrower than twice this are paved as well, m. Chosen."""
+
 LIGHT_AHEAD = 12.2
 """A light stands this far beyond its stop line, m (MUTCD 2009, 4D.14: at least 40 ft)."""
 
@@ -231,8 +234,12 @@ def _pavements(network: Network, shapes: dict[str, Outline]) -> Iterator[tuple[l
         # Lanes cover the paved area but for slivers between their paths.
         whole = shapely.union_all([shapely.make_valid(shapely.Polygon(shape.polygon)) for shape in lanes])
         parts = [part for part in shapely.get_parts(whole) if part.geom_type == "Polygon"]
-        holes = [np.asarray(ring.coords) for part in parts for ring in part.interiors]
-        yield [hole for hole in holes if shapely.Polygon(hole).area <= HOLE], first
+        rings = [ring.coords for part in parts for ring in part.interiors]
+        holes = [np.asarray(ring) for ring in rings if shapely.Polygon(ring).area <= HOLE]
+        closed = whole.buffer(SLIVER, join_style="mitre").buffer(-SLIVER, join_style="mitre")
+        slivers = shapely.get_parts(closed.difference(whole))
+        found = [np.asarray(x.exterior.coords) for x in slivers if x.geom_type == "Polygon"]
+        yield holes + found, first
 
 
 def _bars(network: Network, shapes: dict[str, Outline]) -> Iterator[tuple[Floats, bool]]:

@@ -55,11 +55,12 @@ TINTS = (
 )  # fmt: skip
 """Colours of cars, by their slots."""
 
-GLASS = (52, 62, 72)
-"""Colour of windows."""
+GLASS = (46, 54, 62)
+"""Colour of windows and wheels."""
 
 _SHADES = (1.0, 0.86, 0.72, 0.8)  # top, front and back, left, right: light comes from above and the left
 _WINDOWS = 0.52, 0.88  # of the height
+_WHEELS = 0.24, 0.62, 0.14  # of the height; middle and half width, of half the length
 _LAMP = 0.3, 0.62, 0.3  # lower and upper edge, of the height up to `_LAMP_TOP`; width, of half the width
 _LAMP_TOP = 2.0  # m, lamps of higher bodies are as high as those of a body of this height
 
@@ -171,6 +172,7 @@ def _surface(rays: Rays, hits: Hits, bodies: Bodies) -> _Surface:
     light = slot < 0
     dark = light & ~(end & (ahead < 0))  # a light shines towards the traffic that comes to it
     window = ~light & ~top & (up > _WINDOWS[0]) & (up < _WINDOWS[1]) & (jnp.where(end, sides, ends) < 0.88)
+    window |= ~light & ~top & ~end & (up < _WHEELS[0]) & (jnp.abs(ends - _WHEELS[1]) < _WHEELS[2])
     level = up * of(low)
     corner = ~light & end & (level > _LAMP[0]) & (level < _LAMP[1]) & (sides > 1 - _LAMP[2])
     brake = corner & (ahead < 0) & ((lamps & int(Lamp.BRAKE)) != 0)

@@ -121,7 +121,7 @@ def detect(
         there=bodies.there & vehicle & (hits >= detector.hits) & (missed >= detector.misses),
         id=bodies.slot,
         label=bodies.label,
-        score=hits / (hits + jnp.float32(2 * detector.hits)),
+        score=hits.astype(jnp.float32) / (hits + 2 * detector.hits).astype(jnp.float32),
         x=bodies.x + spread * noise[:, 0],
         y=bodies.y + spread * noise[:, 1],
         heading=bodies.heading + detector.heading_noise * noise[:, 2],
