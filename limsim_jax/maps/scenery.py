@@ -164,7 +164,7 @@ def build_scenery(network: Network, lane_map: LaneMap, *, pixel: float = PIXEL) 
     _paint(canvas, network)
     corner, tile, paint = canvas.tiles()
     lights, behind = _lights(network, lane_map)
-    count = bucket(len(behind), 8)
+    count = bucket(len(behind), 16)
     light, light_lane = np.zeros((count, 3), np.float32), np.full(count, -1, np.int32)
     light[: len(behind)], light_lane[: len(behind)] = lights, behind
     return Scenery(

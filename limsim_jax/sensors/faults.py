@@ -81,7 +81,7 @@ class Faults:
         Raises:
           ValueError: a camera that the rig does not have.
         """
-        rig.only(*self.dropped, *self.frozen)
+        rig.check(*self.dropped, *self.frozen)
         always = [name in (*self.dropped, *self.frozen) for name in rig.names]
         return FaultMemory(
             left=jnp.where(jnp.asarray(always), jnp.inf, 0).astype(jnp.float32),

@@ -170,10 +170,15 @@ class Rig:
         Raises:
           ValueError: a camera that it does not have.
         """
+        self.check(*names)
+        return replace(self, cameras=tuple(c for c in self.cameras if c.name in names))
+
+    def check(self, *names: str) -> None:
+        """Raise `ValueError` if the rig lacks one of these cameras."""
         for name in names:
             if name not in self.names:
-                raise ValueError(f"rig: no camera '{name}'; its cameras are {', '.join(self.names)}")
-        return replace(self, cameras=tuple(c for c in self.cameras if c.name in names))
+                known = ", ".join(self.names) or "none"
+                raise ValueError(f"rig: no camera '{name}'; its cameras are {known}")
 
     def sized(self, width: int, height: int) -> Rig:
         """The rig with pictures of another size (pixels) and the same horizontal view."""

@@ -87,18 +87,11 @@ def oracle(camera, pose, boxes, labels, lamps):
     return np.where(depth < FAR, label, Label.SKY), np.minimum(depth, FAR)
 
 
+TILTED = Camera(x=-1, y=0.5, z=1.6, yaw=2.2, pitch=-0.2, roll=0.3, fov=1.8, width=20, height=12)
+
+
 @pytest.mark.parametrize(
-    "rig",
-    [
-        six_cameras(16, 9),
-        Rig(
-            cameras=(
-                Camera(name="a", z=1.6, yaw=2.2, pitch=-0.3, roll=0.2, width=24, height=16),
-                Camera(name="b", x=-1, y=0.5, pitch=0.1, fov=1.8, width=24, height=16),
-            )
-        ),
-    ],
-    ids=["level", "tilted"],
+    "rig", [six_cameras(20, 12).only("back_left"), Rig(cameras=(TILTED,))], ids=["level", "tilted"]
 )
 def test_another_ray_tracer_sees_the_same(rig):
     """1,000 scenes with 6 boxes: the pixels that differ lie on edges."""
@@ -150,11 +143,10 @@ def test_a_batch_is_its_worlds():
     worlds = [bodies_of(random_boxes(rng, 6)) for _ in range(3)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *worlds)
     batch = jax.jit(jax.vmap(lambda s, b: take_pictures(rig, s, pose_at(), b), (None, 0)))
+    found = batch(scenery(), stacked)
     for n, world in enumerate(worlds):
         alone = picture(rig, world, pose_at())
-        jax.tree.map(
-            lambda a, b, n=n: np.testing.assert_array_equal(a[n], b), batch(scenery(), stacked), alone
-        )
+        jax.tree.map(lambda a, b, n=n: np.testing.assert_array_equal(a[n], b), found, alone)
 
 
 def test_lights_shine_towards_their_traffic():
