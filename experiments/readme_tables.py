@@ -169,8 +169,8 @@ def sensor_speed(result: dict[str, Any]) -> str:
     bodies = result["boxes"] - result["lights"]
     rows += [
         "",
-        f"One core of {result['device']}, {result['worlds']} worlds at once, JAX {result['jax']}. Each frame has "
-        f"{result['boxes']} boxes: {bodies} vehicles and {result['lights']} lights.",
+        f"One core of {result['device']}, {result['worlds']} worlds at once, JAX {result['jax']}. Each frame "
+        f"has {result['boxes']} boxes: {bodies} vehicles and {result['lights']} lights.",
     ]
     return "\n".join(rows)
 

@@ -19,6 +19,9 @@ from limsim_jax.xla import computed_once
 FAR = 1000.0
 """Beyond this depth a camera sees sky, m: about the horizon of flat ground in haze. Chosen."""
 
+MOST_BODIES = 128
+"""Bodies that pictures can show: an integer of 32 bits holds all about a pixel."""
+
 COLORS: dict[Label, tuple[int, int, int]] = {
     Label.SKY: (168, 199, 228),
     Label.TERRAIN: (117, 138, 91),
@@ -110,18 +113,21 @@ def take_pictures(rig: Rig, scenery: Scenery, pose: Pose, bodies: Bodies) -> Pic
       bodies: around it.
 
     Raises:
-      ValueError: a rig without a camera.
+      ValueError: a rig without a camera, or more than `MOST_BODIES`.
     """
     rays = rays_of(rig.cameras)
+    if bodies.x.shape[0] > MOST_BODIES:
+        raise ValueError(f"cameras: {bodies.x.shape[0]} bodies; expected at most {MOST_BODIES}")
     hits = cast(rays, bodies)
     flat_label, flat_depth = _ground(rays, scenery, pose)
     struck = (hits.length < flat_depth) & (hits.length < FAR)
     depth = jnp.minimum(jnp.minimum(hits.length, flat_depth), FAR)
     flat_label = jnp.where(flat_depth < FAR, flat_label, int(Label.SKY))
     paint, label, slot = _surface(rays, hits, bodies)
-    palette = _palette(bodies)
+    palette = computed_once(_palette(bodies))
     paint = jnp.where(struck, paint, 4 * (flat_label + bodies.x.shape[0] + 1))
-    color = lax.bitcast_convert_type(palette.at[paint].get(mode="promise_in_bounds"), jnp.uint8)
+    packed = computed_once(palette.at[paint].get(mode="promise_in_bounds"))
+    color = lax.bitcast_convert_type(packed, jnp.uint8)
     label = jnp.where(struck, label, flat_label)
     return Pictures(label.astype(jnp.uint8), depth, color[..., :3], jnp.where(struck, slot, -1))
 
@@ -158,22 +164,27 @@ def _surface(rays: Rays, hits: Hits, bodies: Bodies) -> _Surface:
     x = rays.x[:, None, None] + hits.length * rays.dx
     y = rays.y[:, None, None] + hits.length * rays.dy
     z = rays.z[:, None, None] + hits.length * rays.dz
-    ahead = of(cos * long) * x + of(sin * long) * y - of(place[0] * long)
-    left = of(cos * wide) * y - of(sin * wide) * x - of(place[1] * wide)
-    up = of(high) * z - of(bodies.z * high)
+    known = (bodies.slot + 1) * 256 + bodies.label * 8 + bodies.lamps
+    columns = (
+        cos * long, sin * long, place[0] * long, cos * wide, sin * wide, place[1] * wide, high,
+        bodies.z * high, known,
+    )  # fmt: skip
+    columns = computed_once(columns)  # per body, not per pixel
+    c_long, s_long, p_long, c_wide, s_wide, p_wide, high, bottom, known = map(of, columns)
+    ahead = c_long * x + s_long * y - p_long
+    left = c_wide * y - s_wide * x - p_wide
+    up = high * z - bottom
     ends, sides, lid = jnp.abs(ahead), jnp.abs(left), jnp.abs(2 * up - 1)
     top = (lid >= ends) & (lid >= sides)
     end = ~top & (ends >= sides)
     shade = jnp.where(top, 0, jnp.where(end, 1, jnp.where(left > 0, 2, 3)))
 
-    low = bodies.height / jnp.minimum(bodies.height, _LAMP_TOP)
-    known = of((bodies.slot + 1) * 256 + bodies.label * 8 + bodies.lamps)
     lamps, label, slot = known & 7, (known >> 3) & 31, (known >> 8) - 1
     light = slot < 0
     dark = light & ~(end & (ahead < 0))  # a light shines towards the traffic that comes to it
     window = ~light & ~top & (up > _WINDOWS[0]) & (up < _WINDOWS[1]) & (jnp.where(end, sides, ends) < 0.88)
     window |= ~light & ~top & ~end & (up < _WHEELS[0]) & (jnp.abs(ends - _WHEELS[1]) < _WHEELS[2])
-    level = up * of(low)
+    level = up * jnp.maximum(1, 1 / (_LAMP_TOP * high))
     corner = ~light & end & (level > _LAMP[0]) & (level < _LAMP[1]) & (sides > 1 - _LAMP[2])
     brake = corner & (ahead < 0) & ((lamps & int(Lamp.BRAKE)) != 0)
     mine = jnp.where(left > 0, int(Lamp.LEFT), int(Lamp.RIGHT))

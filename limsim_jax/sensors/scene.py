@@ -35,6 +35,10 @@ OBJECTS, LIGHTS = 16, 4
 """Bodies and lights that sensors see, unless told: the nearest ones."""
 
 
+MOST_SLOTS = 2**15
+"""Slots of a world with sensors."""
+
+
 class Lamp(enum.IntFlag):
     """Lamps of a vehicle that are on."""
 
@@ -144,9 +148,14 @@ def bodies_around(
       slot: of the ego, whose own body is left out.
       objects: the nearest bodies that count, at most all.
       lights: the nearest lights that count, of those that the ego comes to.
+
+    Raises:
+      ValueError: a world with more than `MOST_SLOTS`.
     """
     pose = pose_of(scene, slot)
     number = scene.v.shape[0]
+    if number > MOST_SLOTS:
+        raise ValueError(f"sensors: {number} slots; expected at most {MOST_SLOTS}")
     seen = scene.active & (jnp.arange(number) != slot) & (jnp.abs(scene.z - scene.z[slot]) <= CLEARANCE)
     near, there = _nearest(scene.box[:, 0] - pose.x, scene.box[:, 1] - pose.y, seen, objects)
     box = scene.box[near]

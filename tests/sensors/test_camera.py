@@ -170,3 +170,8 @@ def test_lamps_are_seen_from_behind():
     assert len(columns) and (columns < 64).all()
     rows, columns = np.nonzero(label == Label.BRAKE_LIGHT)
     assert len(columns) and (columns >= 64).all() and (rows > 36).all()
+
+
+def test_too_many_bodies_are_refused():
+    with pytest.raises(ValueError, match="129 bodies; expected at most 128"):
+        picture(FRONT, bodies_of([Box(9, 0, 0, 0, 1, 1, 1)] * 129))
