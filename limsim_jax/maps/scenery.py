@@ -220,7 +220,10 @@ def _paint(canvas: _Canvas, network: Network) -> None:
 
 
 def _pavements(network: Network, shapes: dict[str, Outline]) -> Iterator[tuple[list[Floats], str]]:
-    """Ground of junctions between their lanes: outlines, each with the lane before which it is painted."""
+    """Ground of junctions between their lanes.
+
+    Outlines, each with the lane before which it is painted.
+    """
     import shapely
 
     for junction in network.junctions.values():
@@ -243,7 +246,10 @@ def _pavements(network: Network, shapes: dict[str, Outline]) -> Iterator[tuple[l
 
 
 def _bars(network: Network, shapes: dict[str, Outline]) -> Iterator[tuple[Floats, bool]]:
-    """Lines `[2, 2]` where traffic stops, and whether they are broken, as where it yields."""
+    """Lines `[2, 2]` where traffic stops, and whether they are broken.
+
+    They are where it yields.
+    """
     marked = {line.spot.lane for line in network.stop_lines}
     for line in network.stop_lines:
         if line.spot.lane in shapes:
@@ -289,7 +295,7 @@ class _Canvas:
                     self._tile(tx, ty)[r : r + part.shape[0], c : c + part.shape[1]][part] = label
 
     def strip(self, left: Floats, right: Floats, label: Label) -> None:
-        """Paint between two borders `[M, 2]`, in pieces that are small beside a tile."""
+        """Paint between two borders `[M, 2]`, in pieces smaller than a tile."""
         length = np.append(0, np.cumsum(np.hypot(*np.diff(left, axis=0).T)))
         if not length[-1] > 0:
             length = np.append(0, np.cumsum(np.hypot(*np.diff(right, axis=0).T)))
@@ -301,7 +307,7 @@ class _Canvas:
             self.fill(np.concatenate([sides[0][a : b + 1], sides[1][a : b + 1][::-1]]), label)
 
     def line(self, line: Floats, width: float, label: Label) -> None:
-        """Paint a line `[M, 2]` of some width (m), at least a pixel."""
+        """Paint a line `[M, 2]` of a width (m)."""
         way = np.gradient(line, axis=0) if len(line) > 2 else np.diff(line, axis=0).repeat(2, 0)
         long = np.hypot(*way.T)
         if not (long > 0).all():
@@ -339,7 +345,7 @@ class _Canvas:
 
 
 def _lights(network: Network, lane_map: LaneMap) -> tuple[Floats, list[int]]:
-    """Lights `[M, 3]` in map coordinates, and the lane whose state each shows.
+    """Lights `[M, 3]` in map coordinates, and the lane behind each.
 
     Ways out of one lane share a light if it shows the same to all of them at any time. Several lights of a
     lane hang side by side, the leftmost for the leftmost way.

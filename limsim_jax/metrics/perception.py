@@ -156,15 +156,19 @@ def intersection_over_union(a: Box, b: Box) -> Float[Array, ""]:
     the other one. Sides that coincide count once.
     """
     middle = a[:2]
-    one, two = (box_corners(jnp.concatenate([box[:2] - middle, box[2:]])) for box in (a, b))
+    one = box_corners(jnp.concatenate([a[:2] - middle, a[2:]]))
+    two = box_corners(jnp.concatenate([b[:2] - middle, b[2:]]))
     common = jnp.maximum(_border(one, two, _TOUCH) + _border(two, one, -_TOUCH), 0)
     return common / (a[3] * a[4] + b[3] * b[4] - common)
 
 
 def _border(corners: Float[Array, "4 2"], other: Float[Array, "4 2"], beyond: float) -> Float[Array, ""]:
-    """Share of the area integral of the sides of a polygon within another; both counter-clockwise."""
+    """Area integral along the sides of a polygon within another.
+
+    Both are counter-clockwise. Sides that are `beyond` m outside count as within.
+    """
     way, sides = jnp.roll(corners, -1, 0) - corners, jnp.roll(other, -1, 0) - other
-    unit = sides / jnp.linalg.norm(sides, axis=-1, keepdims=True)
+    unit = sides / jnp.hypot(sides[:, :1], sides[:, 1:])
     offset = corners[:, None] - other[None]
     # a point at share t of a side is within a half plane where depth + t slope >= -beyond
     depth = unit[None, :, 0] * offset[..., 1] - unit[None, :, 1] * offset[..., 0] + beyond
@@ -245,10 +249,10 @@ def prediction_errors(
     *,
     miss: float = MISS,
 ) -> Prediction:
-    """Displacement errors of the best of `M` modes over `V` vehicles and `H` samples.
+    """Displacement errors of the best mode.
 
     Args:
-      predicted: places, m.
+      predicted: places of `V` vehicles in `M` modes at `H` samples, m.
       truth: where the vehicles were, m.
       valid: samples at which they were there; a vehicle without any does not count.
       miss: m from the last valid place, from which on a prediction is a miss.

@@ -46,7 +46,10 @@ class Raster:
 
     @property
     def middles(self) -> tuple[np.ndarray, np.ndarray]:
-        """x `[H, 1]` and y `[1, W]` of the middles of the cells, m in the frame of the vehicle."""
+        """Middles of the cells: x `[H, 1]` and y `[1, W]`.
+
+        In m, in the frame of the vehicle.
+        """
         rows, columns = self.shape
         x = self.ahead - (np.arange(rows) + 0.5) * self.cell
         y = self.side - (np.arange(columns) + 0.5) * self.cell

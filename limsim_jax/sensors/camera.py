@@ -69,7 +69,10 @@ _LAMP_TOP = 2.0  # m, lamps of higher bodies are as high as those of a body of t
 
 
 class Pictures(NamedTuple):
-    """What the `C` cameras of a rig see, `H` rows from the top and `W` columns from the left."""
+    """What the `C` cameras of a rig see.
+
+    `H` rows from the top, and `W` columns from the left.
+    """
 
     label: UInt8[Array, "C H W"]  # `Label`
     depth: Float[Array, "C H W"]  # m along the axis of the camera; FAR: sky

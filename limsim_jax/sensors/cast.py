@@ -22,10 +22,10 @@ _TINY = 1e-9  # of a direction: less is along the side of a box
 
 
 class Rays(NamedTuple):
-    """Rays of `C` sensors with `H` rows and `W` columns, in the frame of the vehicle.
+    """Rays of `C` sensors with `H` rows and `W` columns.
 
-    Axes `H1` and `W1` of size 1 stand for all rows or columns. Directions have any length; the length of a
-    ray is in units of its direction.
+    They are in the frame of the vehicle. Axes `H1` and `W1` of size 1 stand for all rows or columns.
+    Directions have any length; the length of a ray is in units of its direction.
     """
 
     x: Float[Array, " C"]  # m, origin
@@ -71,7 +71,7 @@ def cast(rays: Rays, bodies: Bodies) -> Hits:
 
 
 def _sides(rays: Rays, bodies: Bodies) -> tuple[Array, Array]:
-    """Lengths at which rays enter and leave the upright sides, `[K, C, H | 1, W]`."""
+    """Lengths to the upright sides, in and out, `[K, C, H1, W]`."""
     cos, sin = (f(bodies.heading)[:, None] for f in (jnp.cos, jnp.sin))
     x, y = rays.x[None] - bodies.x[:, None], rays.y[None] - bodies.y[:, None]  # [K C]
     place = cos * x + sin * y, cos * y - sin * x
@@ -85,7 +85,7 @@ def _sides(rays: Rays, bodies: Bodies) -> tuple[Array, Array]:
 
 
 def _lids(rays: Rays, bodies: Bodies) -> tuple[Array, Array]:
-    """Lengths at which rays enter and leave the heights of boxes, `[K, C, H, W | 1]`."""
+    """Lengths to the upper and lower sides, in and out, `[K, C, H, W1]`."""
     half = (bodies.height / 2)[:, None, None, None]
     place = rays.z[None] - (bodies.z + bodies.height / 2)[:, None]
     return _slab(place[..., None, None], (1 / _sure(rays.dz))[None], half)

@@ -23,7 +23,7 @@ class Purpose(enum.IntEnum):
 
 
 def key_of(key: Key[Array, ""], step: Int[Array, ""] | int, purpose: Purpose) -> Key[Array, ""]:
-    """The key of a step and a purpose, from that of the world."""
+    """The key of a step and a purpose, from the world's."""
     return jax.random.fold_in(jax.random.fold_in(key, step), int(purpose))
 
 
@@ -33,7 +33,10 @@ def delay_line(example: Tree, steps: int) -> Tree:
 
 
 def delayed(line: Tree, now: Tree) -> tuple[Tree, Tree]:
-    """What went in as many calls ago as the memory is long, and the memory."""
+    """What went in before, as many calls as the memory is long.
+
+    Returns it and the memory.
+    """
     steps = jax.tree.leaves(line)[0].shape[0]
     if steps == 0:
         return now, line

@@ -72,7 +72,7 @@ class Faults:
         return whole_steps(self.delay, dt, "faults: delay")
 
     def init(self, rig: Rig, first: Pictures) -> FaultMemory:
-        """No fault yet, but for the cameras that are dropped or frozen all the time.
+        """No fault yet but those that last all the time.
 
         Args:
           rig: of the vehicle.
@@ -99,7 +99,7 @@ class Faults:
         key: Key[Array, ""],
         step: Int[Array, ""] | int,
     ) -> tuple[Pictures, Pose, FaultMemory]:
-        """The pictures and the pose as the vehicle gets them, and the memory.
+        """Pictures and pose as the vehicle gets them, and the memory.
 
         Args:
           memory: of the last step.

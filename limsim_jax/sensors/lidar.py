@@ -66,7 +66,10 @@ def scan_around(
 
 
 def points_of(lidar: Lidar, scan: Scan) -> tuple[Float[Array, "R A 3"], Array]:
-    """Points in the frame of the vehicle (m), and which rays came back `[R, A]`."""
+    """Points in the frame of the vehicle, and which rays came back.
+
+    In m, and as flags `[R, A]`.
+    """
     rays = lidar_rays(lidar)
     flat = scan.range / jnp.sqrt(1 + rays.dz**2)[0]
     way = jnp.stack(jnp.broadcast_arrays(rays.dx[0], rays.dy[0], rays.dz[0]), -1)

@@ -19,7 +19,10 @@ from limsim_jax.sensors.scene import Bodies, Pose
 
 @struct.dataclass(frozen=True, kw_only=True)
 class Objects:
-    """`D` entries of an object list, in the frame of the ego at the moment of the look."""
+    """`D` entries of an object list.
+
+    They are in the frame of the ego at the moment of the look.
+    """
 
     there: Bool[Array, " D"]
     id: Int[Array, " D"]  # slot of the vehicle; below 0: a false track
@@ -63,10 +66,10 @@ class Detector:
     lidar: Lidar = LAYERS_16
     hits: int = 3
     position_noise: float = 0.1
-    position_growth: float = 0.0035
+    position_growth: float = 0.004
     heading_noise: float = 0.05
     size_noise: float = 0.1
-    speed_noise: float = 0.23
+    speed_noise: float = 0.2
     misses: float = 0.05
     false_tracks: float = 0.1
     false_range: float = 40.0
@@ -166,7 +169,7 @@ def _false_tracks(detector: Detector, key: Key[Array, ""], step: Int[Array, ""] 
 
 
 def seen_from(objects: Objects, pose: Pose) -> Objects:
-    """The object list in the frame of another pose, as after some latency."""
+    """The object list in the frame of a later pose."""
     old = objects.pose
     cos, sin = jnp.cos(old.heading), jnp.sin(old.heading)
     x = old.x - pose.x + cos * objects.x - sin * objects.y

@@ -60,7 +60,7 @@ class Camera:
 
     @property
     def axes(self) -> Floats:
-        """Its directions ahead, left and up in the frame of the vehicle, rows `[3, 3]`."""
+        """Its directions ahead, left and up, rows `[3, 3]`."""
         (cy, sy), (cp, sp), (cr, sr) = (
             (math.cos(angle), math.sin(angle)) for angle in (self.yaw, self.pitch, self.roll)
         )
@@ -181,7 +181,7 @@ class Rig:
                 raise ValueError(f"rig: no camera '{name}'; its cameras are {known}")
 
     def sized(self, width: int, height: int) -> Rig:
-        """The rig with pictures of another size (pixels) and the same horizontal view."""
+        """The rig with pictures of another size, in pixels."""
         return replace(self, cameras=tuple(replace(c, width=width, height=height) for c in self.cameras))
 
 

@@ -76,9 +76,9 @@ def ap_by_loops(found, truth, good, better):
         free = set(np.flatnonzero(truth["there"][t]))
         for d in sorted(np.flatnonzero(found["there"][t]), key=lambda d: -found["score"][t, d]):
             values = {k: better(t, d, k) for k in free}
-            best = min(values, key=values.get, default=None)
-            hit = best is not None and good(values[best])
-            if hit:
+            best = min(values, key=lambda k: values[k], default=None)
+            hit = best is not None and bool(good(values[best]))
+            if best is not None and hit:
                 free.remove(best)
             rows.append((found["score"][t, d], hit))
     rows.sort(key=lambda row: -row[0])
@@ -173,7 +173,8 @@ def mot_by_loops(found, truth, most):
 def test_tracking_is_that_of_a_loop_with_scipy(seed):
     found, truth = episode(seed)
     score = _mot(boxes(found), boxes(truth), K)
-    np.testing.assert_allclose(np.array(score, float), mot_by_loops(found, truth, 2.0), rtol=1e-5)
+    expected = np.array(mot_by_loops(found, truth, 2.0), float)
+    np.testing.assert_allclose(np.array(score, float), expected, rtol=1e-5)
     assert int(score.switches) > 0 or seed
 
 
@@ -198,8 +199,8 @@ def test_prediction_errors_are_those_of_a_loop():
             errors = [[np.linalg.norm(predicted[v, m, h] - truth[v, h]) for h in steps] for m in range(3)]
             ade.append(min(np.mean(e) for e in errors))
             fde.append(min(e[-1] for e in errors))
-    arrays = (jnp.asarray(x, jnp.float32) for x in (predicted, truth))
-    score = prediction_errors(*arrays, jnp.asarray(valid), miss=1.5)
+    guess, real = (jnp.asarray(x, jnp.float32) for x in (predicted, truth))
+    score = prediction_errors(guess, real, jnp.asarray(valid), miss=1.5)
     np.testing.assert_allclose(
         np.array(score), [np.mean(ade), np.mean(fde), np.mean(np.array(fde) > 1.5)], rtol=1e-5
     )

@@ -36,7 +36,8 @@ def test_cells_are_where_things_are():
         turned = shapely.affinity.rotate(flat, box.heading, origin=(0, 0), use_radians=True)
         shapes.append(shapely.affinity.translate(turned, box.x, box.y))
     covers = np.stack([shapely.contains_xy(shape, x, y) for shape in shapes])
-    edge = np.stack([shapely.distance(s.exterior, shapely.points(x, y)) for s in shapes]).min(0) < 1e-3
+    near = [shapely.distance(s.exterior, shapely.points(x, y)) for s in shapes]
+    edge = np.asarray(np.stack(near).min(0) < 1e-3)
     assert covers.any() and not edge.all()
     np.testing.assert_array_equal(layer["occupied"][~edge] > 0, covers.any(0)[~edge])
     alone = covers.sum(0) == 1
@@ -44,7 +45,7 @@ def test_cells_are_where_things_are():
     np.testing.assert_allclose(layer["vx"][alone], vx[owner[alone]])
     np.testing.assert_allclose(layer["vy"][alone], vy[owner[alone]])
 
-    away = shapely.distance(shapely.LineString(route), shapely.points(x, y))
+    away = np.asarray(shapely.distance(shapely.LineString(route), shapely.points(x, y)))
     sure = abs(away - RASTER.route_width / 2) > 1e-3
     np.testing.assert_array_equal(layer["route"][sure] > 0, (away < RASTER.route_width / 2)[sure])
 

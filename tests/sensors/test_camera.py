@@ -48,8 +48,8 @@ def test_depth_of_a_slanted_face():
     """
     turn = math.radians(30)
     # the near face of a box with this heading contains (20, 0)
-    middle = np.array([20.0, 0.0]) + 2.0 * np.array([math.cos(turn), math.sin(turn)])
-    found = picture(FRONT, six_bodies_of([Box(*middle, 0, turn, 4, 200, 30)]))
+    x, y = 20.0 + 2.0 * math.cos(turn), 2.0 * math.sin(turn)
+    found = picture(FRONT, six_bodies_of([Box(x, y, 0, turn, 4, 200, 30)]))
     camera = FRONT.cameras[0]
     u = (camera.width / 2 - np.arange(33) - 0.5) / camera.focal
     expected = 18.5 * math.cos(turn) / (math.cos(turn) + u * math.sin(turn))
