@@ -309,7 +309,7 @@ class _Canvas:
     def line(self, line: Floats, width: float, label: Label) -> None:
         """Paint a line `[M, 2]` of a width (m)."""
         way = np.gradient(line, axis=0) if len(line) > 2 else np.diff(line, axis=0).repeat(2, 0)
-        long = np.hypot(*way.T)
+        long = np.hypot(way[:, 0], way[:, 1])
         if not (long > 0).all():
             return
         across = max(width, self.pixel) / 2 * np.stack([-way[:, 1], way[:, 0]], -1) / long[:, None]

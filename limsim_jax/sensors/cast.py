@@ -85,7 +85,7 @@ def _sides(rays: Rays, bodies: Bodies) -> tuple[Array, Array]:
 
 
 def _lids(rays: Rays, bodies: Bodies) -> tuple[Array, Array]:
-    """Lengths to the upper and lower sides, in and out, `[K, C, H, W1]`."""
+    """Lengths to top and bottom, in and out, `[K, C, H, W1]`."""
     half = (bodies.height / 2)[:, None, None, None]
     place = rays.z[None] - (bodies.z + bodies.height / 2)[:, None]
     return _slab(place[..., None, None], (1 / _sure(rays.dz))[None], half)

@@ -35,7 +35,7 @@ def test_cells_are_where_things_are():
         flat = shapely.box(-box.length / 2, -box.width / 2, box.length / 2, box.width / 2)
         turned = shapely.affinity.rotate(flat, box.heading, origin=(0, 0), use_radians=True)
         shapes.append(shapely.affinity.translate(turned, box.x, box.y))
-    covers = np.stack([shapely.contains_xy(shape, x, y) for shape in shapes])
+    covers = np.array([np.asarray(shapely.contains_xy(shape, x, y)) for shape in shapes])
     near = [shapely.distance(s.exterior, shapely.points(x, y)) for s in shapes]
     edge = np.asarray(np.stack(near).min(0) < 1e-3)
     assert covers.any() and not edge.all()
