@@ -241,7 +241,7 @@ def _pavements(network: Network, shapes: dict[str, Outline]) -> Iterator[tuple[l
         holes = [np.asarray(ring) for ring in rings if shapely.Polygon(ring).area <= HOLE]
         closed = whole.buffer(SLIVER, join_style="mitre").buffer(-SLIVER, join_style="mitre")
         slivers = shapely.get_parts(closed.difference(whole))
-        found = [np.asarray(x.exterior.coords) for x in slivers if x.geom_type == "Polygon"]
+        found = [np.asarray(x.exterior.coords) for x in slivers if x.geom_type == "Polygon" and x.area > 0]
         yield holes + found, first
 
 
@@ -269,7 +269,9 @@ class _Canvas:
         self.painted: dict[tuple[int, int], NDArray[np.uint8]] = {}
 
     def fill(self, corners: Floats, label: Label) -> None:
-        """Paint a polygon `[K, 2]` in file coordinates, m."""
+        """Paint a polygon `[K, 2]` in file coordinates, m; without an area nothing."""
+        if len(corners) < 3:
+            return
         p = (corners - self.origin) / self.pixel - 0.5  # middles of pixels are whole numbers
         i0, j0 = np.ceil(p.min(0)).astype(int)
         i1, j1 = np.floor(p.max(0)).astype(int) + 1

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import shapely
+from paths import SHARED, needs_shared
 from traffic_worlds import bundled
 
 from limsim_jax.maps import scenery as module
@@ -43,6 +44,18 @@ def test_polygons_are_filled_as_shapely_says():
         inside = shapely.contains_xy(shape, x, y)
         assert shape.is_valid and inside.any()
         np.testing.assert_array_equal((found == Label.ROAD)[~edge], inside[~edge])
+
+
+def test_polygons_without_an_area_paint_nothing():
+    canvas = module._Canvas(0.25, np.zeros(2), "a map")
+    for corners in (
+        np.zeros((0, 2)),
+        np.zeros((2, 2)),
+        np.ones((4, 2)),
+        np.array([[0, 0.1], [9, 0.1], [4, 0.1]]),
+    ):
+        canvas.fill(corners, Label.ROAD)
+    assert not canvas.painted
 
 
 def test_lanes_are_road_and_the_rest_is_not(painted):
@@ -129,6 +142,24 @@ def test_a_map_that_needs_too_much_memory_is_refused(monkeypatch):
         build_scenery(*bundled("intersection"))
     with pytest.raises(ValueError, match=r"pixel: 0\.0 m"):
         build_scenery(*bundled("intersection"), pixel=0.0)
+
+
+@pytest.mark.slow
+@needs_shared
+def test_maps_of_others_can_be_painted():
+    """Most of their lanes' middles are drivable ground."""
+    files = [*(SHARED / "opendrive").glob("*.xodr"), *(SHARED / "sumo").glob("*/*.net.xml")]
+    assert len(files) > 20
+    for file in files:
+        try:
+            town = load_map(file)
+            arrays = town.lanes
+        except MapError:
+            continue
+        shapes = outlines(town.network)
+        middles = [shapes[x.id].at(x.length / 2, shapes[x.id].centre) for x in town.network.drivable_lanes()]
+        found = labels_at(town.scenery, arrays.origin, np.array(middles))
+        assert np.isin(found, [int(label) for label in DRIVABLE]).mean() > 0.95, file
 
 
 def test_invisible_lanes_are_not_painted():
