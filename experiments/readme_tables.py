@@ -161,6 +161,20 @@ def traffic_speed(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def sensor_speed(result: dict[str, Any]) -> str:
+    """Frames per second of each sensor on one core."""
+    rows = ["| sensor | rays | frames per second | compile, s |", "|---|---:|---:|---:|"]
+    for r in result["rows"]:
+        rows.append(f"| {r['sensor']} | {r['rays']:,} | {r['frames_per_s']:,} | {r['compile_s']:.1f} |")
+    bodies = result["boxes"] - result["lights"]
+    rows += [
+        "",
+        f"One core of {result['device']}, {result['worlds']} worlds at once, JAX {result['jax']}. Each frame "
+        f"has {result['boxes']} boxes: {bodies} vehicles and {result['lights']} lights.",
+    ]
+    return "\n".join(rows)
+
+
 def traffic_sumo(result: dict[str, Any]) -> str:
     """One lane in a sentence, networks side by side."""
     one = result["one_lane"]["ballistic, as ours"]
@@ -338,6 +352,7 @@ TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "merge": merge,
     "policies": policies,
     "random_maps": random_maps,
+    "sensor_speed": sensor_speed,
     "soundness": soundness,
     "sweep_speed": sweep_speed,
     "traffic_against_sumo": traffic_sumo,

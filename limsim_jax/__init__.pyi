@@ -11,6 +11,7 @@ from .api.map import Map as Map
 from .api.map import load_map as load_map
 from .api.results import Results as Results
 from .api.results import open_results as open_results
+from .api.sensed import Sensed as Sensed
 from .api.sweep import sweep as sweep
 from .api.world import World as World
 from .bridges import carla as carla
@@ -39,6 +40,11 @@ from .policies.simple import ConstantSpeed as ConstantSpeed
 from .policies.simple import FollowLane as FollowLane
 from .policies.view import View as View
 from .report import plots as plots
+from .sensors.objects import Detector as Detector
+from .sensors.rig import Camera as Camera
+from .sensors.rig import Lidar as Lidar
+from .sensors.rig import Rig as Rig
+from .sensors.rig import six_cameras as six_cameras
 from .simulation.checkpoint import fork as fork
 from .simulation.rollout import Rollout as Rollout
 from .simulation.worlds import Worlds as Worlds

@@ -23,6 +23,7 @@ ORDER = [
     {"statistics"},
     {"maps"},
     {"traffic", "recordings"},
+    {"sensors"},
     {"policies"},
     {"simulation"},
     {"metrics"},

@@ -33,6 +33,7 @@ NAMES = {
         *("Policy", "HostPolicy", "Observation", "Command", "Control", "Trajectory"),
         *("reference_path", "to_cartesian"),
     ],
+    "Sensors": ["Camera", "Lidar", "Rig", "six_cameras", "Detector", "Sensed"],
     "Step by step": ["Env"],
     "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "Population", "default_population"],
     "Log replay": ["load_scene", "Scene"],

@@ -17,7 +17,9 @@ from limsim_jax.simulation.trace import Trace
 
 if TYPE_CHECKING:
     from limsim_jax.api.futures import Futures
+    from limsim_jax.api.sensed import Sensed
     from limsim_jax.policies.base import PolicyLike
+    from limsim_jax.sensors.rig import Rig
     from limsim_jax.sweeps.episode import Episodes
     from limsim_jax.types import State
 
@@ -132,6 +134,21 @@ class World:
         else:
             write_trace(*place)
         return path
+
+    def sense(self, at: float, rig: Rig | None = None, **options: Any) -> Sensed:
+        """What the ego senses at a moment: pictures, point cloud, bird's-eye view, object list.
+
+        Args:
+          at: s.
+          rig: its cameras and LiDAR; None: the six cameras of LimSim++ and a LiDAR of 16 layers.
+          options: `slot` of another vehicle, `detector` and `raster` (see `sensors`).
+
+        Raises:
+          ValueError: a time outside the record, or no such vehicle at that time.
+        """
+        from limsim_jax.api.sensed import sense
+
+        return sense(self, at, rig, **options)
 
     def fork(
         self,

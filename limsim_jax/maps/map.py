@@ -13,6 +13,7 @@ from limsim_jax.maps.network import ImportReport, Network
 
 if TYPE_CHECKING:
     from limsim_jax.maps.lane_map import LaneMap
+    from limsim_jax.maps.scenery import Scenery
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +81,13 @@ class Map:
         plain = not (self.extra_goals or self.no_exits or self.routes)
         routes = {route_name(roads): roads for roads in self.routes}
         return build_lane_map(self.network, None if plain else self.goals, routes)
+
+    @cached_property
+    def scenery(self) -> Scenery:
+        """What sensors see of the map: painted ground and lights."""
+        from limsim_jax.maps.scenery import build_scenery
+
+        return build_scenery(self.network, self.lanes)
 
     @cached_property
     def lane_ids(self) -> list[str]:

@@ -17,6 +17,7 @@ from limsim_jax.maps.outline import (
     conflict_zones,
     crosswalk_outline,
     crosswalk_stripes,
+    dashes,
     held_ends,
     levels,
     marks,
@@ -25,7 +26,7 @@ from limsim_jax.maps.outline import (
     surface_rank,
     view,
 )
-from limsim_jax.report.draw.symbols import arrows, darts, dashes
+from limsim_jax.report.draw.symbols import arrows, darts
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
