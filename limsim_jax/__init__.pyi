@@ -13,6 +13,7 @@ from .api.results import Results as Results
 from .api.results import open_results as open_results
 from .api.sweep import sweep as sweep
 from .api.world import World as World
+from .bridges.formats.export import export as export
 from .calibration.report import calibrate as calibrate
 from .log_replay.scene import Scene as Scene
 from .log_replay.scene import load_scene as load_scene
