@@ -24,7 +24,7 @@ NAMES = {
         *("Experiment", "Flow", "Ego", "bundled_experiments", "load_experiments", "World", "Futures"),
         "ExperimentError",
     ],
-    "Sweeps": ["sweep", "Results", "Row", "open_results", "Metric", "ResultsError"],
+    "Sweeps": ["sweep", "Results", "Row", "open_results", "export", "Metric", "ResultsError"],
     "Policies": [
         *("LikeTraffic", "ConstantSpeed", "FollowLane", "PDMClosed", "PDMHybrid", "LimSimTM"),
         *("AreaOfInterest", "named"),

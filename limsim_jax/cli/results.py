@@ -346,7 +346,7 @@ def export(
         str | None,
         typer.Option(
             metavar="FORMAT",
-            help="parquet (long table), fcd (SUMO), commonroad or openscenario.  [default: by FILE]",
+            help="parquet (long table), fcd (SUMO), commonroad, openscenario or carla.  [default: by FILE]",
         ),
     ] = None,
     scenario: ScenarioOption = None,
@@ -361,7 +361,7 @@ def export(
         float | None, typer.Option(help="Time between moments, s.  [default: every time step]")
     ] = None,
 ) -> None:
-    """Run one world of the results again and write its trajectories for other tools."""
+    """Run one world again and write its trajectories for other tools."""
     from limsim_jax.api.results import rebuild
     from limsim_jax.api.world import World
     from limsim_jax.bridges.formats.export import FORMATS, format_of

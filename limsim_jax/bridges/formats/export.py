@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from limsim_jax.files import check_writable, write_whole
 
@@ -15,6 +16,7 @@ FORMATS: dict[str, str] = {
     "fcd": ".fcd.xml",
     "commonroad": ".xml",
     "openscenario": ".xosc",
+    "carla": ".log",
 }
 """Formats and the suffixes of their files."""
 
@@ -25,9 +27,9 @@ def export(world: World, path: str | Path, to: str | None = None, *, every: floa
     Args:
       world: a replay, from `Results.replay` or `Replay.world`.
       path: of the file; what is there is replaced.
-      to: parquet (a row per time and vehicle), fcd (SUMO), commonroad or openscenario; None: by the suffix,
-        .parquet, .fcd.xml, .xml or .xosc.
-      every: s between moments, a multiple of the time step; None: every step.
+      to: parquet (a row per time and vehicle), fcd (SUMO), commonroad, openscenario or carla (a recorder
+        log); None: by the suffix, .parquet, .fcd.xml, .xml, .xosc or .log.
+      every: s between moments, a multiple of the time step; None: every step. Not for carla.
 
     Returns:
       The path.
@@ -39,6 +41,12 @@ def export(world: World, path: str | Path, to: str | None = None, *, every: floa
     path = Path(path)
     to = format_of(path, to)
     check_writable(path)
+    if to == "carla":
+        if every is not None:
+            raise ValueError(f"every {every:g} s: a log of CARLA has every step; leave it out")
+        log: Any = importlib.import_module("limsim_jax.bridges.carla_log")
+        log.write_log(path, world)
+        return path
 
     from limsim_jax.bridges.formats.motion import motion_of
 

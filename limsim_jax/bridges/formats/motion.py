@@ -23,7 +23,7 @@ _WHOLE = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """One vehicle from its first to its last moment, `K` moments without a gap.
+    """One vehicle, there at `K` moments without a gap.
 
     Positions are those of the middle of the body, in coordinates of the map file.
     """
@@ -134,7 +134,7 @@ def motion_of(world: World, every: float | None = None) -> Motion:
 
 
 def _rows(time: NDArray[np.float64], step: float, every: float | None) -> tuple[NDArray[np.int64], int]:
-    """Rows of the trace that are kept, and steps between two of them."""
+    """Rows of the trace to keep, and steps between them."""
     count = 1 if every is None else round(every / step)
     if every is not None and (count < 1 or abs(every / step - count) > _WHOLE * max(count, 1)):
         raise ValueError(f"every {every:g} s: a multiple of the time step, {step:g} s, is expected")
