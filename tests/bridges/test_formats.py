@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -46,7 +47,7 @@ def expected(world):
     x, y = absolute(world.map.lanes, trace.box[..., 0], trace.box[..., 1])
     rows = {}
     for t in range(T):
-        for slot in np.flatnonzero(trace.active[t]):
+        for slot in np.flatnonzero(trace.active[t]).tolist():
             number = int(trace.vehicle[t, slot])
             name = "ego" if slot == SELF else f"vehicle_{number}" if number >= 0 else f"start_{slot}"
             assert NAMES.get((slot, number), name) == name
@@ -179,7 +180,7 @@ def test_commonroad_io_reads_what_was_driven(world, expected, tmp_path):
     assert names[0][0] == "ego" and names[0][1] == min(found["obstacles"], key=int)
     seen = set()
     for name, number in names:
-        obstacle = found["obstacles"][number]
+        obstacle, slot = found["obstacles"][number], -1
         for state, on in zip(obstacle["states"], obstacle["on"], strict=True):
             t = state[0]
             x, y, heading, v, slot = expected[t, name]
@@ -220,7 +221,7 @@ def test_only_vehicles_that_come_in_later_are_beyond_the_schema_of_commonroad(wo
     folder = READERS / "commonroad/common/xml_definition_files"
     schema = etree.XMLSchema(etree.parse(str(folder / "XML_commonRoad_XSD.xsd")))
     schema.validate(etree.parse(str(path)))
-    assert [f"The value '{SWAP}' is greater" in error.message for error in schema.error_log] == [True]
+    assert [f"The value '{SWAP}' is greater" in error.message for error in list(schema.error_log)] == [True]
 
 
 def test_our_own_reader_finds_the_same_tracks(world, expected, tmp_path):
@@ -245,7 +246,7 @@ def test_openscenario_is_valid_by_the_schema_of_asam(world, every, tmp_path):
 
 
 def test_openscenario_puts_bodies_where_they_were(world, expected, tmp_path):
-    root = etree.parse(str(lj.export(world, tmp_path / "x.xosc"))).getroot()
+    root: Any = etree.parse(str(lj.export(world, tmp_path / "x.xosc"))).getroot()
     assert root.find("RoadNetwork/LogicFile").get("filepath") == world.map.source
     centre = {
         one.get("name"): float(one.find("Vehicle/BoundingBox/Center").get("x"))

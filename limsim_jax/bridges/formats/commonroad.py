@@ -103,7 +103,7 @@ def _kind(network: Network, lane: Lane) -> str:
 
 
 def _sign(limit: float, number: int, network: Network, lanes: dict[str, int]) -> str:
-    """A virtual sign, at the first lane with this limit, for all of them."""
+    """A virtual sign at the first of the lanes with this limit."""
     lane = next(network.lanes[lane] for lane in lanes if network.lanes[lane].speed_limit == limit)
     x, y = lane.xyz[0, :2].tolist()
     return (

@@ -46,7 +46,7 @@ class Logged:
         return self.still or bool(self.time[0] <= time <= self.time[-1])
 
     def pose(self, time: int) -> tuple[np.ndarray, np.ndarray]:
-        """Position (m) and quaternion at a time (us) at which it is there."""
+        """Position (m) and quaternion at a time (us)."""
         if len(self.time) == 1:
             return self.xyz[0], self.turn[0]
         at = int(np.clip(time, self.time[0], self.time[-1]))
@@ -57,7 +57,7 @@ class Logged:
 
 
 def yaw_of(turn: Any) -> Any:
-    """Angle from the x axis, rad, of quaternions x, y, z, w, `[..., 4]`."""
+    """Angle from the x axis (rad) of quaternions `[..., 4]`."""
     x, y, z, w = np.moveaxis(np.asarray(turn), -1, 0)
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 

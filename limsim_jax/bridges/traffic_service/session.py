@@ -150,7 +150,7 @@ class Session:
     # --- the scene
 
     def _arrays(self) -> tuple[SceneArrays, dict[str, int]]:
-        """The logs as a scene, and the slot of each object that is there for two moments or more."""
+        """The logs as a scene, and slots of objects with two moments."""
         count = (self.end - self._zero) // STEP_US + 2
         grid = self._zero + STEP_US * np.arange(count)
         columns, chosen = [], []
@@ -206,7 +206,7 @@ class Session:
         return times, poses + list(zip(xyz[fresh], yaw_of(turn[fresh]), strict=True))
 
     def _ego_at(self, time: float) -> np.ndarray:
-        """x, y (m, coordinates of the map file) and heading of the ego; beyond its poses straight on."""
+        """x, y (m) and heading of the ego; beyond its poses straight on."""
         times = self._times
         k = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 2))
         (p, h), (q, g) = self._poses[k], self._poses[k + 1]
@@ -287,7 +287,7 @@ def _advance(
 
 
 def _padded(scene: SceneArrays) -> SceneArrays:
-    """The scene with sizes rounded up by vehicles that never come, empty moments and longer paths."""
+    """The scene with sizes rounded up: vehicles that never come, empty moments."""
     count, number = scene.log.x.shape
     sizes = {"T": count, "N": number, "P": scene.path.shape[1]}
     more = {name: -size % _SIZES[name] for name, size in sizes.items()}
