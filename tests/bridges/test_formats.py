@@ -221,7 +221,8 @@ def test_only_vehicles_that_come_in_later_are_beyond_the_schema_of_commonroad(wo
     folder = READERS / "commonroad/common/xml_definition_files"
     schema = etree.XMLSchema(etree.parse(str(folder / "XML_commonRoad_XSD.xsd")))
     schema.validate(etree.parse(str(path)))
-    assert [f"The value '{SWAP}' is greater" in error.message for error in list(schema.error_log)] == [True]
+    errors: Any = schema.error_log
+    assert [f"The value '{SWAP}' is greater" in error.message for error in errors] == [True]
 
 
 def test_our_own_reader_finds_the_same_tracks(world, expected, tmp_path):

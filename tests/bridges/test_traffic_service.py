@@ -169,6 +169,24 @@ def test_traffic_reacts_to_an_ego_that_brakes(client, server, lane, objects):
     assert found["parked"][2] == pytest.approx(0.3, abs=1e-5)
 
 
+@pytest.mark.engine
+@pytest.mark.parametrize("label, keeps", [("car", False), ("Pedestrian", True), ("still", True)])
+def test_only_vehicles_leave_their_logs(label, keeps, client, server, lane, objects):
+    """What follows the ego closely, or stands where it backs to, is taken over if it is a vehicle."""
+    other: Any = objects["behind"] | {"label": label} | place(lane, 85.0 + V * TIME)
+    if label == "still":
+        other = PARKED | {name: float(value) for name, value in place(lane, 150.0).items()}
+    client.start("a", "highway", {"EGO": objects["EGO"], "other": other}, HANDOVER)
+
+    def back(time):
+        return braked(time) - np.maximum(time - 7.0, 0) ** 2
+
+    found = drive(client, "a", lane, TIME[1:90], back)[-1]["other"]
+    at = [np.broadcast_to(other[name], len(other["time"]))[min(89, len(other["time"]) - 1)] for name in "xy"]
+    assert (np.hypot(*np.subtract(found[:2], at)) < 1e-3) == keeps
+    assert server._held["a"].session.off_log() == ([] if keeps else ["other"])
+
+
 class Told:
     """A pilot that puts the ego where the test says."""
 
