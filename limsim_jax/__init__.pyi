@@ -14,6 +14,8 @@ from .api.results import open_results as open_results
 from .api.sweep import sweep as sweep
 from .api.world import World as World
 from .bridges.formats.export import export as export
+from .bridges.traffic_service.client import TrafficClient as TrafficClient
+from .bridges.traffic_service.server import TrafficServer as TrafficServer
 from .calibration.report import calibrate as calibrate
 from .log_replay.scene import Scene as Scene
 from .log_replay.scene import load_scene as load_scene

@@ -24,7 +24,7 @@ NAMES = {
         *("Experiment", "Flow", "Ego", "bundled_experiments", "load_experiments", "World", "Futures"),
         "ExperimentError",
     ],
-    "Sweeps": ["sweep", "Results", "Row", "open_results", "export", "Metric", "ResultsError"],
+    "Sweeps": ["sweep", "Results", "Row", "open_results", "Metric", "ResultsError"],
     "Policies": [
         *("LikeTraffic", "ConstantSpeed", "FollowLane", "PDMClosed", "PDMHybrid", "LimSimTM"),
         *("AreaOfInterest", "named"),
@@ -36,6 +36,7 @@ NAMES = {
     "Step by step": ["Env"],
     "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "Population", "default_population"],
     "Log replay": ["load_scene", "Scene"],
+    "Beside other tools": ["export", "TrafficServer", "TrafficClient"],
 }
 """Public names in the order of the page; all others follow as parts of the engine."""
 

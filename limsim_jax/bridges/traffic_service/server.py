@@ -9,8 +9,9 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,7 @@ class TrafficServer:
     """Serves traffic to other simulators. A context manager: it starts on entering and stops on leaving.
 
     Args:
-      scenes: maps by scene id.
+      scenes: maps by scene id, or the places of `Scenes`: folders, files, names of bundled maps.
       host: address to listen at.
       port: 0: any free one.
       sessions: open at once, at most.
@@ -54,7 +55,7 @@ class TrafficServer:
 
     def __init__(
         self,
-        scenes: Scenes,
+        scenes: Scenes | Iterable[str | Path],
         *,
         host: str = "127.0.0.1",
         port: int = 0,
@@ -67,7 +68,8 @@ class TrafficServer:
                 raise ValueError(f"{name}: {value:g}; more than 0 is expected")
         if not 0 <= port < 2**16:
             raise ValueError(f"port: {port}; 0 to {2**16 - 1} is expected")
-        self.scenes, self.host, self.port = scenes, host, port
+        self.scenes = scenes if isinstance(scenes, Scenes) else Scenes(scenes)
+        self.host, self.port = host, port
         self.most, self.idle, self.workers = sessions, idle, workers
         self._held: dict[str, _Held] = {}
         self._registry = threading.Lock()
