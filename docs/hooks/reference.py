@@ -36,7 +36,7 @@ NAMES = {
     "Step by step": ["Env"],
     "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "Population", "default_population"],
     "Log replay": ["load_scene", "Scene"],
-    "Beside other tools": ["export", "TrafficServer", "TrafficClient"],
+    "Beside other tools": ["export", "TrafficServer", "TrafficClient", "DriverServer", "remote_driver"],
 }
 """Public names in the order of the page; all others follow as parts of the engine."""
 

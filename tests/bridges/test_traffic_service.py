@@ -111,10 +111,10 @@ def test_messages_are_those_of_the_proto_files(tmp_path):
 
     folder = REPO / "limsim_jax/bridges/traffic_service"
     out = tmp_path / "set.bin"
-    names = ["common.proto", "traffic.proto"]
+    names = ["common.proto", "traffic.proto", "driver.proto"]
     assert protoc.main(["protoc", f"-I{folder}", f"--descriptor_set_out={out}", *names]) == 0
     compiled = descriptor_pb2.FileDescriptorSet.FromString(out.read_bytes())
-    for file, name in zip(compiled.file, ("common", "traffic"), strict=True):
+    for file, name in zip(compiled.file, ("common", "traffic", "driver"), strict=True):
         ours = messages.file_descriptor(name)
         for one in (*file.message_type, *(n for m in file.message_type for n in m.nested_type)):
             for field in one.field:

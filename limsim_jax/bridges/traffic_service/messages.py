@@ -1,4 +1,4 @@
-"""The messages of `common.proto` and `traffic.proto`, made when they are first used.
+"""The messages of the `.proto` files here, made when they are first used.
 
 Generated code fits few versions of protobuf; descriptors fit all. They lie in a pool of their own, so that a
 process may also hold AlpaSim's generated code.
@@ -18,6 +18,10 @@ METHODS = {
     "get_available_scenes": ("common.Empty", "common.AvailableScenesReturn"),
 }
 """Method to the types of its request and its answer."""
+
+DRIVER = "driver.DriverService"
+DRIVER_METHODS = {"drive": ("driver.DriveRequest", "driver.DriveReturn")}
+"""Likewise, of planners in other processes."""
 
 FILES: dict[str, dict[str, str]] = {
     "common": {
@@ -44,6 +48,11 @@ FILES: dict[str, dict[str, str]] = {
         "*traffic.ObjectTrajectoryUpdate object_trajectory_updates=3",
         "TrafficReturn": "*traffic.ObjectTrajectoryUpdate object_trajectory_updates=1",
         "TrafficModuleMetadata": "common.VersionId version_id=1, fixed64 minimum_history_length_us=2",
+    },
+    "driver": {
+        "Array": "string name=1, *uint32 shape=2, *float values=3",
+        "DriveRequest": "*driver.Array seen=1",
+        "DriveReturn": "*driver.Array command=1",
     },
 }
 """File to message to fields: type, name and number; *: repeated."""
@@ -77,7 +86,7 @@ def message(name: str) -> Any:
 
 
 def file_descriptor(name: str) -> Any:
-    """What `protoc` makes of a file: common or traffic."""
+    """What `protoc` makes of a file: common, traffic or driver."""
     try:
         from google.protobuf import descriptor_pb2
     except ModuleNotFoundError:
@@ -103,8 +112,12 @@ def file_descriptor(name: str) -> Any:
         made.dependency.append("common.proto")
         within["TrafficModuleMetadata"].reserved_range.add(start=3, end=4)
         within["TrafficModuleMetadata"].reserved_name.append("supported_map_ids")
-        service = made.service.add(name=SERVICE.rpartition(".")[2])
-        for method, (asked, given) in METHODS.items():
+    for full, methods in ((SERVICE, METHODS), (DRIVER, DRIVER_METHODS)):
+        package, _, own = full.partition(".")
+        if package != name:
+            continue
+        service = made.service.add(name=own)
+        for method, (asked, given) in methods.items():
             service.method.add(name=method, input_type=f".{asked}", output_type=f".{given}")
     return made
 
@@ -124,4 +137,4 @@ def _camel(word: str) -> str:
     return first + "".join(part.capitalize() for part in rest)
 
 
-__all__ = ["FILES", "METHODS", "SERVICE", "file_descriptor", "grpc", "message"]
+__all__ = ["DRIVER", "DRIVER_METHODS", "FILES", "METHODS", "SERVICE", "file_descriptor", "grpc", "message"]

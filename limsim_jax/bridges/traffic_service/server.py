@@ -92,7 +92,7 @@ class TrafficServer:
           ValueError: the port is in use, or the host has no such address.
         """
         rpc = grpc()
-        _check_port(self.host, self.port)
+        check_port(self.host, self.port)
         handlers = {
             name: rpc.unary_unary_rpc_method_handler(
                 self._guarded(getattr(self, f"_{name}"), message(given)),
@@ -268,7 +268,7 @@ def _unknown(name: str) -> RequestError:
     return RequestError("NOT_FOUND", f"no session '{name}': never started, closed, or idle for too long")
 
 
-def _check_port(host: str, port: int) -> None:
+def check_port(host: str, port: int) -> None:
     """Refuse a port that is in use: gRPC's own message is several lines on standard error."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
