@@ -1,5 +1,6 @@
 """Traffic as a service: a real server on this machine, and clients that do right and wrong."""
 
+import gzip
 import os
 import re
 import signal
@@ -15,10 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fake_replays import intersection_trace
 from paths import REPO
 
 import limsim_jax as lj
 from limsim_jax import cli
+from limsim_jax.api.world import World
 from limsim_jax.log_replay.arrays import build_arrays
 from limsim_jax.log_replay.takeover import Ego, Mode, Takeover, replay
 from limsim_jax.maps.lane_map import absolute, relative
@@ -350,6 +353,18 @@ def test_metadata_and_scenes(tmp_path):
         refused(
             lambda: client.start("x", "town", objects, 1.0), "FAILED_PRECONDITION", "scene 'town': .*xodr"
         )
+
+
+@pytest.mark.parametrize("gzipped", [False, True])
+def test_a_recording_is_a_scene(gzipped, tmp_path):
+    network, _, trace = intersection_trace()
+    path = lj.export(World("", "", 0, 0, lj.Map(network), trace, {}, []), tmp_path / "USA_a-1_2.T.xml")
+    if gzipped:
+        path.with_name(f"{path.name}.gz").write_bytes(gzip.compress(path.read_bytes()))
+        path.unlink()
+    scenes = Scenes([tmp_path])
+    assert scenes.ids == ["USA_a-1_2.T"]
+    assert len(scenes.map("USA_a-1_2.T").network.lanes) == len(list(network.drivable_lanes()))
 
 
 # --- the command

@@ -1,4 +1,4 @@
-"""The messages of the `.proto` files here, made when they are first used.
+"""The messages of the `.proto` files here, made at their first use.
 
 Generated code fits few versions of protobuf; descriptors fit all. They lie in a pool of their own, so that a
 process may also hold AlpaSim's generated code.

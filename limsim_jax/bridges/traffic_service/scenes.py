@@ -11,7 +11,7 @@ from limsim_jax.maps import bundled_map, bundled_maps, read_network
 from limsim_jax.recordings import read_tracks
 
 ENDINGS = (".xodr", ".net.xml", ".xml")
-"""OpenDRIVE, SUMO, CommonRoad; also gzipped, but for the last."""
+"""OpenDRIVE, SUMO, CommonRoad; also gzipped."""
 
 
 class Scenes:
@@ -53,8 +53,8 @@ class Scenes:
         file = self._files[scene_id]
         with self._locks[scene_id]:
             if scene_id not in self._maps:
-                suffixes = "".join(file.suffixes).lower()
-                plain = suffixes.endswith(".xml") and not suffixes.endswith(".net.xml")
+                name = file.name.lower().removesuffix(".gz")
+                plain = name.endswith(".xml") and not name.endswith(".net.xml")
                 network = read_tracks(file).network if plain else read_network(file)
                 self._maps[scene_id] = Map(network)
                 _ = self._maps[scene_id].lanes
