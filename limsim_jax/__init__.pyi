@@ -15,6 +15,11 @@ from .api.sensed import Sensed as Sensed
 from .api.sweep import sweep as sweep
 from .api.world import World as World
 from .bridges import carla as carla
+from .bridges.formats.export import export as export
+from .bridges.traffic_service.client import TrafficClient as TrafficClient
+from .bridges.traffic_service.driver import DriverServer as DriverServer
+from .bridges.traffic_service.driver import remote_driver as remote_driver
+from .bridges.traffic_service.server import TrafficServer as TrafficServer
 from .calibration.report import calibrate as calibrate
 from .log_replay.scene import Scene as Scene
 from .log_replay.scene import load_scene as load_scene

@@ -37,7 +37,14 @@ NAMES = {
     "Step by step": ["Env"],
     "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "Population", "default_population"],
     "Log replay": ["load_scene", "Scene"],
-    "Beside other tools": ["carla"],
+    "Beside other tools": [
+        "carla",
+        "export",
+        "TrafficServer",
+        "TrafficClient",
+        "DriverServer",
+        "remote_driver",
+    ],
 }
 """Public names in the order of the page; all others follow as parts of the engine."""
 

@@ -16,6 +16,7 @@ from limsim_jax.cli import fitting, results
 from limsim_jax.cli.bench import bench_app
 from limsim_jax.cli.maps import map_app
 from limsim_jax.cli.run import run
+from limsim_jax.cli.serve import serve_app
 
 # XLA logs an error for every program that it loads from its own cache on a CPU; nothing is wrong.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -29,6 +30,7 @@ app = typer.Typer(
 )
 app.add_typer(map_app, name="map")
 app.add_typer(bench_app, name="bench")
+app.add_typer(serve_app, name="serve")
 app.command()(run)
 results.add_commands(app)
 fitting.add_commands(app)

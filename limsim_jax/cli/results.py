@@ -1,4 +1,4 @@
-"""Commands about sweeps and their results: sweep, report, compare, verify, replay."""
+"""Commands about sweeps and their results: sweep, report, compare, verify, replay, export."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import functools
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -48,7 +48,7 @@ SECONDS = 60.0
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    for command in (sweep, warm, report, compare, verify, replay):
+    for command in (sweep, warm, report, compare, verify, replay, export):
         app.command()(command)
 
 
@@ -308,8 +308,7 @@ def replay(
         raise typer.BadParameter(
             f"'{path}': use .html, .gif, .mp4, .png, .parquet or .npz", param_hint="--out"
         )
-    if not 0 <= seed < 2**31:
-        raise typer.BadParameter(f"{seed}; it has to be within 0 and 2^31 - 1", param_hint="--seed")
+    _check_seed(seed)
     moving, still = path.suffix in (".gif", ".mp4"), path.suffix == ".png"
     options = {
         "--at": (at, still), "--from": (begin, moving), "--to": (end, moving),
@@ -323,9 +322,7 @@ def replay(
         raise typer.BadParameter(
             "a view is fixed or follows a vehicle; leave out --follow", param_hint="--bounds"
         )
-    stored = _stored(opened, group, seed)
-    if stored is None:
-        print(f"note: the results hold no seed {seed} of {group[0]} ({group[1]}); it is run now")
+    stored = _known(opened, group, seed)
     path.parent.mkdir(parents=True, exist_ok=True)
     world = World.run(rebuild(opened, *group), seed)
     for row in world.moments:
@@ -336,13 +333,57 @@ def replay(
         saved = f", had braked in time, would have avoided it: {' or '.join(able)}" if able else ""
         module = f", avoided by a reference {row['module']} module" if row.get("module") else ""
         print(f"{row['time']:6.1f} s  {row['kind']}{value}{who}{saved}{module}")
-    if stored is not None and (
-        differs := [x for x, value in world.metrics.items() if not _alike(value, stored[x])]
-    ):
-        print(f"note: not the episode that is stored: {', '.join(differs[:3])} differ; 'verify' may tell why")
+    _tell_differences(world.metrics, stored)
     given = {"at": at, "begin": begin, "end": end, "follow": follow, "bounds": area}
     world.save(path, **{name: value for name, value in given.items() if value is not None})
     print(f"wrote {path}")
+
+
+def export(
+    results: ResultsArgument,
+    seed: Annotated[int, typer.Option(help="Which world.")],
+    to: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FORMAT",
+            help="parquet (long table), fcd (SUMO), commonroad, openscenario or carla.  [default: by FILE]",
+        ),
+    ] = None,
+    scenario: ScenarioOption = None,
+    policy: PolicyOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="File to write.  [default: RESULTS/exports/SCENARIO-POLICY-SEED...]"
+        ),
+    ] = None,
+    every: Annotated[
+        float | None, typer.Option(help="Time between moments, s.  [default: every time step]")
+    ] = None,
+) -> None:
+    """Run one world again and write its trajectories for other tools."""
+    from limsim_jax.api.results import rebuild
+    from limsim_jax.api.world import World
+    from limsim_jax.bridges.formats.export import FORMATS, format_of
+    from limsim_jax.bridges.formats.export import export as write
+    from limsim_jax.files import check_writable
+    from limsim_jax.sweeps.store import open_results
+
+    if to is None and out is None:
+        raise typer.BadParameter(f"name one of {', '.join(FORMATS)}", param_hint="--to")
+    name = format_of(out, to)
+    _check_seed(seed)
+    if every is not None and not every > 0:
+        raise typer.BadParameter(f"{every:g} s; more than 0 is expected", param_hint="--every")
+    opened = open_results(results)
+    group = _group(opened, scenario, policy)
+    path = results / "exports" / f"{group[0]}-{group[1]}-{seed}{FORMATS[name]}" if out is None else out
+    path.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(path)
+    stored = _known(opened, group, seed)
+    world = World.run(rebuild(opened, *group), seed, explain=False)
+    _tell_differences(world.metrics, stored)
+    print(f"wrote {write(world, path, name, every=every)}")
 
 
 # --- helpers -----------------------------------------------------------------------------------------
@@ -380,6 +421,26 @@ def _stored(results: Results, group: tuple[str, str], seed: int) -> dict[str, An
     )
     rows = table.filter(wanted).to_pylist()
     return rows[0] if rows else None
+
+
+def _known(results: Results, group: tuple[str, str], seed: int) -> dict[str, Any] | None:
+    """The row of a seed; a note if there is none."""
+    found = _stored(results, group, seed)
+    if found is None:
+        print(f"note: the results hold no seed {seed} of {group[0]} ({group[1]}); it is run now")
+    return found
+
+
+def _check_seed(seed: int) -> None:
+    if not 0 <= seed < 2**31:
+        raise typer.BadParameter(f"{seed}; it has to be within 0 and 2^31 - 1", param_hint="--seed")
+
+
+def _tell_differences(metrics: Mapping[str, float], stored: Mapping[str, Any] | None) -> None:
+    """A note if a world is not the one that is stored."""
+    differs = [] if stored is None else [x for x, value in metrics.items() if not _alike(value, stored[x])]
+    if differs:
+        print(f"note: not the episode that is stored: {', '.join(differs[:3])} differ; 'verify' may tell why")
 
 
 def _alike(value: float, stored: float | None) -> bool:

@@ -82,6 +82,7 @@ class SceneArrays:
     touched: Bool[Array, "N N"]  # pairs that overlap in the log
     driver: Driver  # [N], as they drive in the log
     v0: Float[Array, " N"]  # m/s, desired speed of those taken over
+    keeps: Bool[Array, " N"] | None = None  # never taken over: parked vehicles, pedestrians, cycles
 
 
 def build_arrays(recorded: Tracks, lane_map: LaneMap) -> SceneArrays:

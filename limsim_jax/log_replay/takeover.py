@@ -125,7 +125,7 @@ class Moment(NamedTuple):
     active: Bool[Array, " N"]
 
 
-class _Going(NamedTuple):
+class Going(NamedTuple):
     """What a step changes."""
 
     mode: Int[Array, " N"]
@@ -230,18 +230,14 @@ def replay(
     count, number = scene.log.x.shape
     zero = jnp.zeros(number, jnp.float32)
     none = jnp.zeros(number, jnp.int32)
-    start = _Going(
-        mode=none, active=scene.first == 0, waiting=zero > 0, p=zero, v=zero, a=zero,
-        rest=jnp.zeros((number, 3), jnp.float32), switched=zero + 1e6, off=zero, clear=zero, settled=zero,
-        before=jnp.zeros((number, 4), jnp.float32),
-    )  # fmt: skip
+    start = begin(scene)
     counts = Record(
         takeovers=none, ended=none, handed_back=none, in_time=none, late=none, controlled=zero,
         displacement=zero, delayed=zero, hardest=zero, jump=zero,
         struck=jnp.zeros((number, number), bool), under_control=zero > 0,
     )  # fmt: skip
 
-    def step(carry: tuple[_Going, Record, Any], t: Array) -> tuple[tuple[_Going, Record, Any], Moment | None]:
+    def step(carry: tuple[Going, Record, Any], t: Array) -> tuple[tuple[Going, Record, Any], Moment | None]:
         going, counts, flight = carry
         now, moment, events = _step(scene, ego, options, going, flight, t)
         counts = _count(scene, options, going, now, counts, moment, events)
@@ -276,9 +272,36 @@ def replay_many(
     return lax.map(one, (egos, keys), batch_size=at_once)
 
 
+def begin(scene: SceneArrays) -> Going:
+    """Before the first moment: all vehicles on their logs."""
+    number = scene.log.x.shape[1]
+    zero = jnp.zeros(number, jnp.float32)
+    return Going(
+        mode=jnp.zeros(number, jnp.int32), active=scene.first == 0, waiting=zero > 0, p=zero, v=zero, a=zero,
+        rest=jnp.zeros((number, 3), jnp.float32), switched=zero + 1e6, off=zero, clear=zero, settled=zero,
+        before=jnp.zeros((number, 4), jnp.float32),
+    )  # fmt: skip
+
+
+def advance(
+    scene: SceneArrays, ego: Ego, options: Takeover, going: Going, flight: Flight | None, t: Int[Array, ""]
+) -> tuple[Going, Moment]:
+    """All vehicles at moment `t`, and what moves them to the next: a step of `replay`.
+
+    Args:
+      scene: what was recorded.
+      ego: the vehicle that deviates from its log.
+      options: of the takeover.
+      going: of `begin`, or of the moment before.
+      flight: the ego in the plane at this moment; None: it follows `ego`.
+      t: number of the moment; moments follow one another.
+    """
+    return _step(scene, ego, options, going, flight, t)[:2]
+
+
 def _step(
-    scene: SceneArrays, ego: Ego, options: Takeover, going: _Going, flight: Flight | None, t: Int[Array, ""]
-) -> tuple[_Going, Moment, _Events]:
+    scene: SceneArrays, ego: Ego, options: Takeover, going: Going, flight: Flight | None, t: Int[Array, ""]
+) -> tuple[Going, Moment, _Events]:
     """All vehicles at moment `t`, and their motion to the next."""
     log = scene.log
     count, number = log.x.shape
@@ -339,6 +362,8 @@ def _step(
     ended = (scene.last - t <= round(_ENDS / log.dt)) & (scene.last < count - 1) & (mine & off_log).any()
     ended &= (apart < options.keep**2) & (scene.limit - scene.p[-1] > _ROAD)
     could = active & on_log & ~told
+    if scene.keeps is not None:
+        could &= ~scene.keeps
     taken = could & (meets | ended)
     for _ in range(1 + _CHAIN):
         taken |= could & urgent & (off_log | taken)[lead.who]
@@ -374,7 +399,7 @@ def _step(
     wanted = jnp.where(told, ego.acceleration[t], wanted)
     v_next, way = ballistic(v, wanted, log.dt)
     moves = active & ~on_log
-    now = _Going(
+    now = Going(
         mode=mode, active=active, waiting=waiting, p=jnp.where(moves, p + way, p),
         v=jnp.where(moves, v_next, v), a=jnp.where(moves, (v_next - v) / log.dt, a), rest=rest,
         switched=switched + log.dt, off=off + log.dt, clear=clear, settled=settled,
@@ -539,8 +564,8 @@ def _bodies(
 def _count(
     scene: SceneArrays,
     options: Takeover,
-    before: _Going,
-    now: _Going,
+    before: Going,
+    now: Going,
     counts: Record,
     moment: Moment,
     events: _Events,
@@ -619,12 +644,15 @@ def braking(
 __all__ = [
     "Ego",
     "Flight",
+    "Going",
     "Mode",
     "Moment",
     "Pilot",
     "Record",
     "Takeover",
+    "advance",
     "as_logged",
+    "begin",
     "braking",
     "replay",
     "replay_many",

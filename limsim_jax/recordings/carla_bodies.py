@@ -1,6 +1,7 @@
 """Sizes of CARLA's vehicles, and the one most like ours.
 
-Bounding boxes of blueprints of CARLA 0.9, as a server gives them (`Actor.bounding_box`), rounded to mm. The box of `vehicle.lincoln.mkz_2017` equals the one in CARLA's own recorder logs.
+Bounding boxes of blueprints of CARLA 0.9, as a server gives them (`Actor.bounding_box`), rounded to mm.
+The box of `vehicle.lincoln.mkz_2017` equals the one in CARLA's own recorder logs.
 """
 
 from __future__ import annotations
