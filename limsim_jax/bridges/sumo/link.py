@@ -47,7 +47,7 @@ LOOK_AT_ROUTES = 1.0
 
 OPTIONS = (
     "--no-step-log", "--duration-log.disable", "--no-warnings",
-    "--collision.action", "warn", "--collision.check-junctions",
+    "--collision.action", "warn", "--collision.check-junctions", "--collision.mingap-factor", "0",
 )  # fmt: skip
 """SUMO reports collisions and leaves vehicles where they are, so that both sides tell the same story."""
 
@@ -80,6 +80,8 @@ class Link:
         self._owned: dict[int, str] = {}
         self._route_of: dict[int, tuple[str, Any]] = {}  # what tells whether a route is another one
         self._ghosts: dict[int, str] = {}
+        self._natives: list[tuple[float, float]] = []
+        self._known_at, self._names = -1, frozenset[str]()
 
     def started(self) -> Started:
         """What there is."""
@@ -104,9 +106,20 @@ class Link:
                 self._move(handle, move)
         self.sumo.simulationStep()
         self._steps += 1
+        # SUMO derives speeds from ways along its lanes, which may be declared longer than they are
+        for handle, move in orders.move.items():
+            name = self._owned.get(handle)
+            if move.v is not None and name in self._there():
+                self.sumo.vehicle.setPreviousSpeed(name, move.v, move.a)
         return self.read()
 
     # --- owners
+
+    def _there(self) -> frozenset[str]:
+        """Vehicles on the road now."""
+        if self._known_at != self._steps:
+            self._known_at, self._names = self._steps, frozenset(self.sumo.vehicle.getIDList())
+        return self._names
 
     def _take(self, handle: int) -> None:
         name = self._name(handle)
@@ -258,9 +271,9 @@ class Link:
         edges = self._edges(name)
         self._route_of[handle] = self._mark(name)
         return Newcomer(
-            handle, name, get.getVehicleClass(name), get.getLength(name), get.getWidth(name), get.getTau(name),
-            get.getMinGap(name), get.getAccel(name), get.getDecel(name), get.getEmergencyDecel(name),
-            get.getMaxSpeed(name), get.getSpeedFactor(name), edges,
+            handle, name, get.getVehicleClass(name), get.getLength(name), get.getWidth(name),
+            get.getTau(name), get.getMinGap(name), get.getAccel(name), get.getDecel(name),
+            get.getEmergencyDecel(name), get.getMaxSpeed(name), get.getSpeedFactor(name), edges,
         )  # fmt: skip
 
     def _edges(self, name: str) -> tuple[str, ...]:

@@ -92,6 +92,8 @@ class Move(NamedTuple):
     x: float
     y: float
     angle: float
+    v: float | None = None  # m/s; None: as the way tells
+    a: float = 0.0  # m/s^2
     edges: tuple[str, ...] = ()  # of our route, from the present edge on; empty: as SUMO has it
     ghost: tuple[float, float, float] | None = None  # x, y and angle on a second lane
 

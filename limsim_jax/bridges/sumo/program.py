@@ -10,7 +10,9 @@ contacts and metrics, but where they are is what SUMO says. A tick has two halve
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -144,7 +146,8 @@ class SharedWorld:
             slot=slot, free=zero > 0, x=zero, y=zero, heading=zero, steering=zero, a=zero,
         )  # fmt: skip
         lights = replace(state.lights, phase=seen.phase)
-        state = replace(state, d=d, a=jnp.where(there, seen.a, 0), vehicle=seen.number, egos=bound, lights=lights)
+        a = jnp.where(there, seen.a, 0)
+        state = replace(state, d=d, a=a, vehicle=seen.number, egos=bound, lights=lights)
         egos = sync(lanes, state, boxes(lanes, state)).egos
         if self.policy.free:
             half, heading = seen.shape.length[slot] / 2, seen.heading[slot]
@@ -153,9 +156,9 @@ class SharedWorld:
                 x=seen.x[slot] - half * jnp.cos(heading), y=seen.y[slot] - half * jnp.sin(heading),
             )  # fmt: skip
         state = replace(state, egos=egos)
-        memory = sighted(self.policy).init(self.planning, lanes, state)
-        shapes = jax.eval_shape(self._move, lanes, state, memory, self._no_command(lanes, state, memory),
-                                jnp.bool_(True), jax.random.key(0))[0]  # fmt: skip
+        memory = self._policy.init(self.planning, lanes, state)
+        held = self._no_command(lanes, state, memory)
+        shapes = jax.eval_shape(self._move, lanes, state, memory, held, jnp.bool_(True), jax.random.key(0))[0]
         moved = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(state=state)
         stood = Stood(state.distance, jnp.zeros_like(state.distance))
         measured = self.measure.init(self.config, lanes, state)
@@ -254,26 +257,43 @@ class SharedWorld:
         )
         return without(state, ~there), left, dx
 
-    def _move(
-        self, lanes: LaneMap, state: State, memory: Any, held: Command, due: Bool[Array, ""], key: Key[Array, ""]
-    ) -> tuple[Moved, Any]:
+    # Jitted, although within a jitted function: both uses share one trace.
+
+    @cached_property
+    def _policy(self) -> PolicyLike:
+        return sighted(self.policy)
+
+    @cached_property
+    def _decide(self) -> Callable[..., tuple[Command, Any]]:
+        return jax.jit(partial(self._policy, self.planning))
+
+    @cached_property
+    def _move(self) -> Callable[..., tuple[Moved, Any]]:
         """Our vehicles a step on."""
-        policy, planning = sighted(self.policy), self.planning
-        command, memory = lax.cond(
-            due, lambda: policy(planning, lanes, state, memory, key), lambda: (held, memory)
-        )
-        after, records = drive(
-            self.config, self.traffic, lanes, state, None, command,
-            lambda tick: (tick.decision, tick.dx, tick.left), free=self.policy.free,
-        )  # fmt: skip
-        decision, dx, left = jax.tree.map(lambda x: x[0], records)
-        return Moved(after, decision, dx, left, command), memory
+
+        def move(
+            lanes: LaneMap,
+            state: State,
+            memory: Any,
+            held: Command,
+            due: Bool[Array, ""],
+            key: Key[Array, ""],
+        ) -> tuple[Moved, Any]:
+            command, memory = lax.cond(
+                due, lambda: self._decide(lanes, state, memory, key), lambda: (held, memory)
+            )
+            after, records = drive(
+                self.config, self.traffic, lanes, state, None, command,
+                lambda tick: (tick.decision, tick.dx, tick.left), free=self.policy.free,
+            )  # fmt: skip
+            decision, dx, left = jax.tree.map(lambda x: x[0], records)
+            return Moved(after, decision, dx, left, command), memory
+
+        return jax.jit(move)
 
     def _no_command(self, lanes: LaneMap, state: State, memory: Any) -> Command:
         """A command of the shapes of the policy's."""
-        shapes = jax.eval_shape(
-            sighted(self.policy), self.planning, lanes, state, memory, jax.random.key(0)
-        )[0]
+        shapes = jax.eval_shape(self._decide, lanes, state, memory, jax.random.key(0))[0]
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     def _pushed(self, lanes: LaneMap, state: State) -> Pushed:

@@ -128,8 +128,8 @@ class Ways:
             return self._free.pop()
         if not self._idle:
             raise SumoError(
-                f"{self._table.distance.shape[1] - 1} routes at the same time are too many; fewer worlds per call "
-                "(chunk) or fewer slots are needed"
+                f"more than {self._table.distance.shape[1] - 1} routes at the same time; "
+                "fewer worlds per call (chunk) or fewer slots are needed"
             )
         column = next(iter(self._idle))
         del self._idle[column]
@@ -176,7 +176,9 @@ class Lights:
         known = self._known[row]
         if state not in known:
             if len(state) > self._state.shape[2]:
-                raise SumoError(f"light '{name}' shows {len(state)} links; the map has {self._state.shape[2]}")
+                raise SumoError(
+                    f"light '{name}' shows {len(state)} links; the map has {self._state.shape[2]}"
+                )
             if set(state) - set(LETTERS):
                 raise SumoError(f"light '{name}' shows '{state}'; known letters are {''.join(LETTERS)}")
             if self._used[row] >= self._room:
