@@ -38,7 +38,7 @@ from limsim_jax.sweeps.identity import is_foreign, policy_code
 from limsim_jax.sweeps.moments import key_moments
 from limsim_jax.sweeps.reruns import Replay
 from limsim_jax.sweeps.store import Outcome
-from limsim_jax.xla import enable_compilation_cache
+from limsim_jax.xla import enable_compilation_cache, run_often, run_once
 
 WAYS = 3
 """Columns of the route table per slot of all worlds: routes of vehicles that are there, and of the last."""
@@ -130,7 +130,7 @@ class SumoEpisodes:
             self._refuse("slots", f"{experiment.slots}, but there are {self.egos} egos and their traffic")
         if getattr(self._policy, "others", 0):
             self._refuse("policy", "it drives other vehicles as well; those belong to SUMO")
-        self.town: Map = map_of(experiment)
+        self._town: Map = map_of(experiment)
         own = tuple(metrics)
         try:
             self._measure = (
@@ -149,10 +149,10 @@ class SumoEpisodes:
         except ValueError as error:
             self._refuse("ego.view", str(error))
         self._code = policy_code(self._policy) if is_foreign(self._policy) else None
-        self._ways = Ways(self.town.network, self.town.lanes, WAYS * experiment.slots * self.chunk + 1)
+        self._ways = Ways(self._town.network, self._town.lanes, WAYS * experiment.slots * self.chunk + 1)
         self._lights: Lights | None = None
         self._places: Places | None = None
-        self._map = self.town.lanes
+        self._map = self._town.lanes
 
     def _refuse(self, field: str, message: str) -> NoReturn:
         raise ExperimentError(f"{self.experiment.name}: {field}: {message}")
@@ -164,9 +164,21 @@ class SumoEpisodes:
         return units | {total.name: total.meaning for total in TOTALS} | UNITS
 
     @property
+    def town(self) -> Map:
+        """The map, with the routes and lights that SUMO has shown so far."""
+        shown = replace(self._town)
+        shown.__dict__["lanes"] = self.lane_map
+        return shown
+
+    @property
+    def lights(self) -> list[str]:
+        """Ids of SUMO's lights, in its order; empty before the first run."""
+        return [] if self._lights is None else self._lights.names
+
+    @property
     def network(self) -> Any:
         """The map on the host."""
-        return self.town.network
+        return self._town.network
 
     @property
     def lane_map(self) -> LaneMap:
@@ -179,7 +191,7 @@ class SumoEpisodes:
         with self._process(0) as sumo:
             version = sumo.there.version
         return provenance_of(
-            self.experiment, self.town.network, self._policy, self._values, self.chunk, self._code
+            self.experiment, self._town.network, self._policy, self._values, self.chunk, self._code
         ) | {
             "devices": 1,
             "engine": {
@@ -243,8 +255,8 @@ class SumoEpisodes:
             for seed in seeds:
                 sumo = stack.enter_context(self._process(seed))
                 if self._lights is None:
-                    self._places = Places(self.town.network, self.town.lanes, sumo.there)
-                    self._lights = Lights(self.town.network, self.town.lanes, sumo.there.lights)
+                    self._places = Places(self._town.network, self._town.lanes, sumo.there)
+                    self._lights = Lights(self._town.network, self._town.lanes, sumo.there.lights)
                 worlds.append(self._world(sumo, seed))
                 stack.callback(worlds[-1].seats.close)
             return self._drive(worlds, keep)
@@ -281,11 +293,11 @@ class SumoEpisodes:
     @cached_property
     def _compiled(self) -> tuple[Any, Any, Any]:
         enable_compilation_cache()
-        program = self.program
+        program, once = self.program, run_once()
         return (
-            jax.jit(jax.vmap(program.start, (None, 0))),
-            jax.jit(jax.vmap(program.tick, (None, 0, 0, None, 0))),
-            jax.jit(jax.vmap(program.result, (None, 0))),
+            jax.jit(jax.vmap(program.start, (None, 0)), compiler_options=once),
+            jax.jit(jax.vmap(program.tick, (None, 0, 0, None, 0)), compiler_options=run_often()),
+            jax.jit(jax.vmap(program.result, (None, 0)), compiler_options=once),
         )
 
     def _lanes(self) -> LaneMap:

@@ -173,7 +173,7 @@ class Seats:
         rows = [on[h] for h in others]
         place = np.stack([reading.x, reading.y], -1)
         if not eyes:
-            return [h for h in others if h in self.slot][:room]
+            return sorted(others, key=lambda h: h not in self.slot)[:room]
         away = np.min(np.sum((place[rows][:, None] - place[eyes][None]) ** 2, -1), 1)
         return [others[i] for i in np.argsort(away, kind="stable")[:room]]
 
