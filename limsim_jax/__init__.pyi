@@ -13,6 +13,9 @@ from .api.results import Results as Results
 from .api.results import open_results as open_results
 from .api.sweep import sweep as sweep
 from .api.world import World as World
+from .bridges.sumo.messages import SumoError as SumoError
+from .bridges.sumo.referee import referee as referee
+from .bridges.sumo.world import SumoWorld as SumoWorld
 from .calibration.report import calibrate as calibrate
 from .log_replay.scene import Scene as Scene
 from .log_replay.scene import load_scene as load_scene

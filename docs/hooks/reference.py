@@ -36,6 +36,7 @@ NAMES = {
     "Step by step": ["Env"],
     "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "Population", "default_population"],
     "Log replay": ["load_scene", "Scene"],
+    "Beside SUMO": ["SumoWorld", "referee", "SumoError"],
 }
 """Public names in the order of the page; all others follow as parts of the engine."""
 

@@ -136,7 +136,7 @@ def world(config: Path) -> Any:
     patch.setattr(episodes_module, "SumoProcess", Watched)
     patch.setattr(episodes_module, "run_often", run_once)  # it compiles in a fraction of the time
     yield SumoWorld(
-        config, policy=lj.ConstantSpeed(), takeover=(30, 60), horizon=30.0, slots=24, chunk=2,
+        config, policy=lj.ConstantSpeed(), takeover=(30, 60), horizon=30.0, slots=40, chunk=2,
         success={"sumo_collisions": 0.0},
     )  # fmt: skip
     patch.undo()
@@ -183,13 +183,27 @@ def test_a_replay_shows_what_sumo_said(world: SumoWorld, town: Map, tmp_path: Pa
         box = shown.trace.box[t][shown.trace.active[t]]
         away = np.hypot(box[:, None, 0] - x, box[:, None, 1] - y).min(1)
         assert away.max() < 0.3  # m: on curved lanes SUMO's bodies are chords of other polylines
-        assert shown.trace.active[t].sum() == min(len(reading.handle), 24)
+        assert shown.trace.active[t].sum() == len(reading.handle)
         for row, state in zip(rows, reading.lights, strict=True):
             letters = np.asarray(signals.state)[row, shown.trace.phase[t, row], : len(state)]
             assert letters.tolist() == [LETTERS[x] for x in state]
     assert ego == 0
     path = shown.save(tmp_path / "world.parquet")
     assert path.stat().st_size > 1000
+
+
+@pytest.mark.engine
+def test_sumo_watches_a_world_that_we_have_driven(world: SumoWorld, tmp_path: Path) -> None:
+    outcome = world.episodes.run([0, 3])
+    seed = int(outcome.seeds[np.flatnonzero(outcome.metrics["contacts"] > 0)[0]])
+    shown = world.run(seed)
+    fcd = tmp_path / "fcd.xml"
+    verdict = lj.referee(shown, fcd=fcd)
+    assert verdict.steps == len(shown.trace.time)
+    assert verdict.vehicles > 20 and verdict.echo < 0.01
+    ours = [c.time for c in verdict.collisions if shown.ego in c.slots]
+    assert min(ours) == pytest.approx(shown.metrics["contact_time"], abs=0.11)
+    assert fcd.read_text().count("<timestep") >= verdict.steps
 
 
 # --- the command

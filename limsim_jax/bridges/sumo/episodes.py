@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -153,6 +154,8 @@ class SumoEpisodes:
         self._lights: Lights | None = None
         self._places: Places | None = None
         self._map = self._town.lanes
+        self.seconds: dict[str, list[float]] = {"decide": [], "drive": []}
+        """s per world that ticks took: those with a decision of the policy, and those without."""
 
     def _refuse(self, field: str, message: str) -> NoReturn:
         raise ExperimentError(f"{self.experiment.name}: {field}: {message}")
@@ -277,8 +280,12 @@ class SumoEpisodes:
         steps = round(self.experiment.horizon / dt)
         for step in range(steps + 1):
             now = _stacked(seen, pad)
-            carry, trace, pushed = tick(self._lanes(), carry, now, np.bool_(step == 0), keys)
+            lanes, began = self._lanes(), time.perf_counter()
+            carry, trace, pushed = tick(lanes, carry, now, np.bool_(step == 0), keys)
             pushed = jax.device_get(pushed)
+            due = step % self.experiment.decision_every == 0
+            if step:  # the first may compile
+                self.seconds["decide" if due else "drive"].append((time.perf_counter() - began) / self.chunk)
             if step and keep:
                 traces.append(jax.device_get(trace))
             if step == steps or not any(world.alive for world in worlds):
