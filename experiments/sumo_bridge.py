@@ -31,7 +31,13 @@ from limsim_jax.statistics import wilson
 
 RESULTS = Path(__file__).parent / "results"
 DATA = Path(os.environ.get("LIMSIM_SHARED_DATA", "shared/data")) / "sumo"
-ALL = ("ingolstadt1", "bologna_pasubio", "limsim_town05", "limsim_roundabout", "limsim_bigInter")
+ALL: tuple[str, ...] = (
+    "ingolstadt1",
+    "bologna_pasubio",
+    "limsim_town05",
+    "limsim_roundabout",
+    "limsim_bigInter",
+)
 HORIZON = 120.0  # s
 VEHICLES, RATE = 30, 300.0  # of our traffic at the start, and veh/h at each origin
 COLUMNS = ("success", "contacts", "completion", "nuplan_score", "mean_speed")
@@ -54,7 +60,7 @@ def config(net: str, folder: Path) -> Path:
     return path
 
 
-def figures(outcome: Any, seconds: list[float] | None) -> dict[str, Any]:
+def figures(outcome: Any, seconds: dict[str, list[float]] | None) -> dict[str, Any]:
     """Means over seeds, and the interval of the success."""
     table = outcome.episodes.to_pydict()
     found = {x: float(np.nanmean(np.array(table[x], float))) for x in COLUMNS if x in table}
@@ -90,10 +96,11 @@ def rows(nets: list[str], policies: list[str], seeds: int, folder: Path) -> list
     return found
 
 
-def cost(net: str, folder: Path) -> dict[str, float]:
+def cost(net: str, folder: Path) -> dict[str, Any]:
     """µs per vehicle and step: to read it, and to move it; and how many vehicles there are."""
     found = {}
     with SumoProcess(Start(arguments=("-c", str(config(net, folder))), seed=1, dt=0.1)) as process:
+        reading = process.step(Orders())
         for _ in range(WARM):
             reading = process.step(Orders())
         count = len(reading.handle)
@@ -140,7 +147,7 @@ def markdown(found: dict[str, Any]) -> str:
 
 def main() -> None:
     """Run, and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--nets", default="ingolstadt1")
     parser.add_argument("--policies", default="pdm_closed,limsim_tm")

@@ -1,1 +1,1 @@
-"""Worlds beside other simulators, in other libraries' shapes, and in other tools' formats."""
+"""Worlds beside other simulators, and in the shapes of other tools."""

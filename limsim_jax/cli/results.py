@@ -86,7 +86,7 @@ def sweep(
     engine: Annotated[
         Literal["limsim", "sumo"],
         typer.Option(
-            help="Who drives the other vehicles: limsim, or SUMO itself (a .sumocfg; extra 'sumo')."
+            help="What drives the other vehicles: limsim, or SUMO itself (a .sumocfg; extra 'sumo')."
         ),
     ] = "limsim",
     ego: Annotated[

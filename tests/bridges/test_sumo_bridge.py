@@ -394,6 +394,7 @@ def test_equal_seeds_are_equal_simulations(nets: Path) -> None:
     found = []
     for seed in (1, 1, 2):
         with SumoProcess(replace(demand(nets, text), seed=seed)) as process:
+            reading = process.step(Orders())
             for _ in range(400):
                 reading = process.step(Orders())
             found.append((reading.x.tobytes(), reading.v.tobytes()))

@@ -11,7 +11,7 @@ import pytest
 
 import limsim_jax as lj
 from limsim_jax.bridges.sumo import episodes as episodes_module
-from limsim_jax.bridges.sumo.messages import Orders, Reading, Start
+from limsim_jax.bridges.sumo.messages import Orders, Reading, Start, SumoError
 from limsim_jax.bridges.sumo.process import SumoProcess
 from limsim_jax.bridges.sumo.seats import Places, Seats
 from limsim_jax.bridges.sumo.ways import LETTERS, Lights, Ways
@@ -64,6 +64,8 @@ def test_every_vehicle_has_one_seat_or_is_counted(config: Path, town: Map) -> No
     with SumoProcess(Start(arguments=("-c", str(config)), seed=1, dt=0.1)) as process:
         lights = Lights(town.network, town.lanes, process.there.lights)
         seats = Seats(Places(town.network, town.lanes, process.there), ways, lights, 12)
+        reading = process.step(Orders())
+        seats.meet(reading)
         for _ in range(300):
             reading = process.step(Orders())
             seats.meet(reading)
@@ -108,7 +110,8 @@ def test_a_route_is_a_column_until_nobody_drives_it(town: Map) -> None:
     others = [ways.take(edges, "car") for edges in (("C1B1", "B1A1"), ("A1B1", "B1B2"))]
     assert first in others, "its place is used again"
     with pytest.raises(ValueError, match="routes at the same time"):
-        ways.take(("B1B2",), "bus"), ways.take(("A0A1",), "car"), ways.take(("C1C2",), "car")
+        for edges in (("A1A2",), ("A0A1",), ("C1C2",)):
+            ways.take(edges, "car")
 
 
 # --- the whole
@@ -206,6 +209,32 @@ def test_sumo_watches_a_world_that_we_have_driven(world: SumoWorld, tmp_path: Pa
     assert fcd.read_text().count("<timestep") >= verdict.steps
 
 
+class Dying(SumoProcess):
+    """Is killed while it warms up, with seed 1."""
+
+    made: ClassVar[list[SumoProcess]] = []
+
+    def __init__(self, start: Start) -> None:
+        super().__init__(start)
+        Dying.made.append(self)
+
+    def step(self, orders: Orders) -> Reading:
+        if self.start.seed == 1 and self.time > 3.0:
+            self.child.kill()
+            self.child.wait()
+        return super().step(orders)
+
+
+def test_a_simulation_that_dies_ends_all_of_them(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episodes_module, "SumoProcess", Dying)
+    episodes = SumoWorld(config, policy="like_traffic", takeover=(5, 5), chunk=2).episodes
+    with pytest.raises(SumoError, match=r"^the process of SUMO has ended \(seed 1, 3\.1 s, signal 9\)$"):
+        episodes.run([0, 1])
+    assert len(Dying.made) == 2 and all(x.child.poll() is not None for x in Dying.made)
+    with pytest.raises(SumoError, match="vehicle 'ghost' is never on the road"):
+        SumoWorld(config, ego="ghost", policy="like_traffic").episodes.run([0])
+
+
 # --- the command
 
 
@@ -217,7 +246,7 @@ def test_what_does_not_fit_is_one_line(
         (["highway", "--engine", "sumo"], "SUMO runs a .sumocfg"),
         ([str(config), "--engine", "sumo", "--map", "highway"], "not with --engine sumo"),
         (["highway", "--ego", "e.3"], "only with --engine sumo"),
-        ([str(config), "--engine", "sumo", "--policy", "nobody"], "unknown policy 'nobody'"),
+        ([str(config), "--engine", "sumo", "--policy", "none"], "unknown policy 'none'"),
         ([str(tmp_path / "none.sumocfg"), "--engine", "sumo"], "none.sumocfg"),
     ):
         assert main(["sweep", *arguments, *out]) == 2

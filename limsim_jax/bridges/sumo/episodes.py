@@ -90,7 +90,9 @@ class Takeover:
 
 
 class SumoEpisodes:
-    """Runs a `.sumocfg` with our planner in it, a few worlds at a time: each has a SUMO of its own.
+    """Runs a `.sumocfg` with our planner in it.
+
+    A few worlds run at a time, each with a SUMO of its own.
 
     Args:
       experiment: of `world.experiment_of`; its demand is the `.sumocfg`.
@@ -168,7 +170,7 @@ class SumoEpisodes:
 
     @property
     def town(self) -> Map:
-        """The map, with the routes and lights that SUMO has shown so far."""
+        """The map, with routes and lights that SUMO has shown."""
         shown = replace(self._town)
         shown.__dict__["lanes"] = self.lane_map
         return shown
@@ -185,7 +187,7 @@ class SumoEpisodes:
 
     @property
     def lane_map(self) -> LaneMap:
-        """The map on the device, with the lights that SUMO has shown so far."""
+        """The map on the device, with lights that SUMO has shown."""
         return self._map if self._lights is None else self._lights.put_on(self._map)
 
     def provenance(self) -> dict[str, Any]:
@@ -364,7 +366,7 @@ class _World:
         self._gone = np.zeros(egos, bool)
 
     def begin(self) -> Seen:
-        """Let SUMO run until the egos are on the road, and take them over."""
+        """Run SUMO until the egos are there, and take them over."""
         takeover, begin = self._of.takeover, self.sumo.there.time
         rng = np.random.default_rng([self.seed, 0x5010])
         at = begin + rng.uniform(takeover.earliest, takeover.latest)
@@ -408,10 +410,10 @@ class _World:
         column = ways.take(one.edges, class_of(one))
         fits = ways.reaches(row, column) and ways.to_go(row, column) - self.reading.s[k] >= LEAST_TRIP
         ways.give_back(column)
-        return fits
+        return bool(fits)
 
     def push(self, pushed: Pushed) -> None:
-        """Tell SUMO where our vehicles will be, and let it begin its step."""
+        """Tell SUMO where our vehicles will be; it begins its step."""
         x0, y0 = self.seats.places.origin
         moves, remove = {}, []
         for k, handle in enumerate(self.seats.egos):

@@ -1,4 +1,4 @@
-"""A simulation of SUMO in this process, by libsumo, and who owns which vehicle.
+"""SUMO in this process, and the owners of its vehicles.
 
 libsumo holds one simulation per process: a second one replaces the first in silence. So `process.SumoProcess`
 runs each in a process of its own. Facts about `moveToXY` and modes are measured with SUMO 1.28.
@@ -37,8 +37,8 @@ KEEP_EXACTLY = 2
 """`keepRoute` of `moveToXY`: the exact place counts, also beside the middle of the lane."""
 
 MATCH_WITHIN = 5.0
-"""m from a place within which SUMO looks for its lane. Its own 100 m take 5 to 50 times as long, up to 20 ms for
-a vehicle on CARLA's Town05."""
+"""m from a place within which SUMO looks for its lane. Its own 100 m take 5 to 50 times as long: up to 20 ms
+for a vehicle on CARLA's Town05."""
 
 NATIVE_NEAR = 50.0
 """m around a body on two lanes within which a vehicle of SUMO makes it worth a ghost."""
@@ -157,7 +157,7 @@ class Link:
         self._owned[body.handle] = body.id
 
     def _insert(self, name: str, edge: str, kind: str, body: Body) -> None:
-        """A vehicle on an edge, where `moveToXY` puts it in the same step."""
+        """A new vehicle; `moveToXY` places it in the same step."""
         sumo = self.sumo
         if kind not in sumo.vehicletype.getIDList():
             sumo.vehicletype.copy("DEFAULT_VEHTYPE", kind)
@@ -181,7 +181,7 @@ class Link:
             self._with_ghost(handle, name, move.ghost)
 
     def _reroute(self, name: str, edges: tuple[str, ...]) -> None:
-        """Give a vehicle our route, from the edge on which SUMO has it.
+        """Give a vehicle our route, from its present edge on.
 
         Within a junction SUMO takes no new route; on the edge before it needs the right one."""
         vehicle = self.sumo.vehicle
@@ -281,7 +281,7 @@ class Link:
         )  # fmt: skip
 
     def _edges(self, name: str) -> tuple[str, ...]:
-        """Edges to go, from the present one up to the first that comes twice."""
+        """Edges to go, up to the first that comes twice."""
         route = self.sumo.vehicle.getRoute(name)[max(self.sumo.vehicle.getRouteIndex(name), 0) :]
         for k, edge in enumerate(route):
             if edge in route[:k]:
@@ -289,7 +289,7 @@ class Link:
         return tuple(route)
 
     def _mark(self, name: str) -> tuple[str, Any]:
-        """Changes when the edges to go are others than those that are known."""
+        """Changes when the vehicle has another way to go."""
         route = self.sumo.vehicle.getRoute(name)
         twice = len(set(route)) < len(route)
         return self.sumo.vehicle.getRouteID(name), self.sumo.vehicle.getRouteIndex(name) if twice else None

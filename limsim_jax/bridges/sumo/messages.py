@@ -5,6 +5,7 @@ Places are those of SUMO: the middle of the front bumper, m; angles in degrees c
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -65,7 +66,7 @@ class Newcomer(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """The vehicles on the road after a step, `V` of them, and what has happened in it."""
+    """The road after a step: `V` vehicles, and what has happened."""
 
     time: float  # s
     handle: NDArray[np.int32]
@@ -118,4 +119,4 @@ class Orders:
     remove: tuple[int, ...] = ()  # vehicles of ours that have left
     add: tuple[Body, ...] = ()
     move: dict[int, Move] = field(default_factory=dict)
-    lights: dict[str, str | None] = field(default_factory=dict)  # state; None: SUMO's program again
+    lights: Mapping[str, str | None] = field(default_factory=dict)  # state; None: SUMO's program again

@@ -210,7 +210,7 @@ class SharedWorld:
     def _settled(
         self, lanes: LaneMap, carry: SharedCarry, seen: Seen
     ) -> tuple[State, Bool[Array, " N"], Float[Array, " N"]]:
-        """The world with SUMO's vehicles where they are; who has left, and how far all have come (m)."""
+        """The world with SUMO's vehicles where they are; those that have left; how far all came (m)."""
         before, moved = carry.state, carry.moved
         after, dt = moved.state, self.dt
         foreign = jnp.arange(seen.lane.shape[0]) >= self.egos

@@ -73,7 +73,7 @@ def referee(world: World, *, fcd: str | Path | None = None) -> Verdict:
         Places(network, world.map.lanes, sumo.there)
         before: set[int] = set()
         for t, time in enumerate(trace.time):
-            now = {runs.handle(t, slot): int(slot) for slot in np.flatnonzero(trace.active[t])}
+            now = {runs.handle(t, int(slot)): int(slot) for slot in np.flatnonzero(trace.active[t])}
             there = set(now)
             add = tuple(runs.body(h, t, now[h]) for h in sorted(there - before, reverse=True))
             moves = {h: runs.move(h, t, slot) for h, slot in now.items()}

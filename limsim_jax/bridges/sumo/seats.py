@@ -58,7 +58,7 @@ class Places:
 
 
 class Seats:
-    """The slots of one world, and who sits in them.
+    """The slots of one world, and the vehicles in them.
 
     Args:
       places: of SUMO's lanes.
@@ -80,8 +80,8 @@ class Seats:
         self._count = 0
         self._busy = np.full(slots, -1, np.int64)  # handle in the slot
         zero = np.zeros(slots, np.float32)
-        self._driver = {f.name: zero.copy() for f in fields(Driver)}
-        self._shape = {f.name: zero.copy() for f in fields(Shape)}
+        self._driver: dict[str, Any] = {f.name: zero.copy() for f in fields(Driver)}
+        self._shape: dict[str, Any] = {f.name: zero.copy() for f in fields(Shape)}
         self._shape["vehicle_class"] = np.zeros(slots, np.int32)
         for k in range(slots):
             self._fit(k, typical())
@@ -89,7 +89,7 @@ class Seats:
         self._goal = np.zeros(slots, np.int32)
 
     def meet(self, reading: Reading) -> None:
-        """Take note of vehicles that have come, and forget those that have gone."""
+        """Take note of newcomers, and forget vehicles that have gone."""
         for one in reading.new:
             self.known[one.handle] = one
         for handle in reading.gone:
@@ -156,16 +156,22 @@ class Seats:
         present = np.zeros(self.slots, bool)
         present[slot] = True
         there = set(reading.handle.tolist())
-        return Seen(
-            present=present, fresh=fresh, arrived=arrived, number=self._number.copy(), goal=self._goal.copy(),
-            driver=Driver(**{name: x.copy() for name, x in self._driver.items()}),
-            shape=Shape(**{name: x.copy() for name, x in self._shape.items()}),
-            phase=self.lights.phases(reading.lights),
-            lost=np.int32(lost),
-            ended=np.array([h not in there for h in self.egos], bool),
-            alive=np.bool_(alive),
-            **found,
-        )  # fmt: skip
+        driver: dict[str, Any] = {name: x.copy() for name, x in self._driver.items()}
+        shape: dict[str, Any] = {name: x.copy() for name, x in self._shape.items()}
+        found |= {
+            "present": present,
+            "fresh": fresh,
+            "arrived": arrived,
+            "number": self._number.copy(),
+            "goal": self._goal.copy(),
+            "driver": Driver(**driver),
+            "shape": Shape(**shape),
+            "phase": self.lights.phases(reading.lights),
+            "lost": np.int32(lost),
+            "ended": np.array([h not in there for h in self.egos], bool),
+            "alive": np.bool_(alive),
+        }
+        return Seen(**found)
 
     def _nearest(self, reading: Reading, on: dict[int, int], others: list[int], room: int) -> list[int]:
         """Those that are nearest to an ego."""
@@ -249,7 +255,7 @@ def shape_of(one: Newcomer) -> dict[str, float]:
 
 
 def heading_of(angle: Any) -> Any:
-    """SUMO's angle (degrees clockwise from north) as a heading (rad), within -pi and pi."""
+    """SUMO's angle (degrees clockwise from north) as a heading (rad)."""
     heading = np.radians(90.0 - np.asarray(angle, np.float64))
     return np.arctan2(np.sin(heading), np.cos(heading))
 

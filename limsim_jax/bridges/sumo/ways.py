@@ -1,4 +1,4 @@
-"""SUMO's routes as columns of the route table, and its lights as phases, made as they come."""
+"""SUMO's routes as columns of the route table; its lights as phases."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LETTERS = {
 
 
 class Ways:
-    """Columns of the route table for the routes of vehicles, found when they are asked for.
+    """Columns of the route table for the routes of vehicles.
 
     Column 0 leads nowhere: that of vehicles whose route cannot be driven on this map.
 
@@ -82,11 +82,11 @@ class Ways:
         return self._edges.get(column, ())
 
     def reaches(self, lane: int, column: int) -> bool:
-        """Whether the way leads from a lane to the end of the route."""
+        """Whether a lane leads to the end of the route."""
         return bool(self._table.reachable[lane, column])
 
     def to_go(self, lane: int, column: int) -> float:
-        """From the start of a lane to the end of the route, m."""
+        """From the start of a lane to the route's end, m."""
         return float(self._table.distance[lane, column])
 
     def table(self) -> RouteTable:
@@ -123,7 +123,7 @@ class Ways:
         return column
 
     def _place(self) -> int:
-        """A column that is free, or that has had no user for the longest time."""
+        """A free column, or the one that is idle for longest."""
         if self._free:
             return self._free.pop()
         if not self._idle:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from pydantic import ValidationError
 
@@ -31,7 +31,7 @@ COARSEST = 0.1
 
 
 class SumoWorld:
-    """A `.sumocfg` in which our planner drives one of SUMO's vehicles, or several.
+    """A `.sumocfg` in which our planner drives some of SUMO's vehicles.
 
         world = lj.SumoWorld("town.sumocfg", policy=lj.LimSimTM())
         world.run(seed=3).show()
@@ -131,7 +131,8 @@ class SumoWorld:
         """
         from limsim_jax.api.world import World
 
-        return World.run(self.episodes, seed, ego)
+        episodes: Any = self.episodes
+        return World.run(episodes, seed, ego)
 
     def sweep(
         self,
@@ -162,8 +163,8 @@ class SumoWorld:
         chosen = range(seeds) if isinstance(seeds, int) else seeds
         with progress_bar(progress) as show:
             runner.sweep([self.episodes], chosen, path, progress=show, fresh=fresh)
-        found = Results(open_results(path))
-        found._made |= {(self.episodes.scenario, self.episodes.policy): self.episodes}
+        found, episodes = Results(open_results(path)), cast("Any", self.episodes)
+        found._made |= {(episodes.scenario, episodes.policy): episodes}
         return found
 
     def __repr__(self) -> str:
