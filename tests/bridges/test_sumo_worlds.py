@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,7 +16,7 @@ from limsim_jax.bridges.sumo.messages import Orders, Reading, Start, SumoError
 from limsim_jax.bridges.sumo.process import SumoProcess
 from limsim_jax.bridges.sumo.seats import Places, Seats
 from limsim_jax.bridges.sumo.ways import LETTERS, Lights, Ways
-from limsim_jax.bridges.sumo.world import SumoWorld
+from limsim_jax.bridges.sumo.world import SumoWorld, rebuild
 from limsim_jax.cli.main import main
 from limsim_jax.maps.map import Map, load_map
 from limsim_jax.xla import run_once
@@ -233,6 +234,17 @@ def test_a_simulation_that_dies_ends_all_of_them(config: Path, monkeypatch: pyte
     assert len(Dying.made) == 2 and all(x.child.poll() is not None for x in Dying.made)
     with pytest.raises(SumoError, match="vehicle 'ghost' is never on the road"):
         SumoWorld(config, ego="ghost", policy="like_traffic").episodes.run([0])
+
+
+def test_stored_worlds_are_built_again_as_they_were(config: Path) -> None:
+    one = SumoWorld(config, ego="e.3", policy="like_traffic", horizon=40.0, chunk=3).episodes
+    about = json.loads(json.dumps(one.provenance()))
+    again = rebuild(about)
+    assert (again.scenario, again.policy, again.chunk) == ("cross", "like_traffic", 3)
+    assert again.takeover == one.takeover and again.takeover.vehicles == ("e.3",)
+    assert json.loads(json.dumps(again.provenance())) == about
+    assert about["engine"]["version"].startswith("SUMO ")
+    assert str(config.parent / "cross.rou.xml") in about["demand"]
 
 
 # --- the command
