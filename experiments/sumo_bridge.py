@@ -47,9 +47,9 @@ STEPS = 200  # that are timed
 
 def config(net: str, folder: Path) -> Path:
     """The `.sumocfg` of a network, or one for its files."""
-    there = DATA / net / f"{net}.sumocfg"
-    if there.exists():
-        return there
+    for there in (DATA / net / f"{net}.sumocfg", DATA / net / "run.sumocfg"):
+        if there.exists():
+            return there
     network = next((DATA / net).glob("*.net.xml"))
     routes = sorted((DATA / net).glob("*.rou.xml"), key=lambda x: "vtypes" not in x.name)
     path = folder / f"{net}.sumocfg"

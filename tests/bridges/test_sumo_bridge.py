@@ -107,9 +107,9 @@ def test_sumo_reports_our_vehicle_where_we_put_it(net: str) -> None:
     folder = SHARED / "sumo" / net
     network = next(folder.glob("*.net.xml"))
     types_first = sorted(folder.glob("*.rou.xml"), key=lambda x: "vtypes" not in x.name)
-    config = folder / f"{net}.sumocfg"
+    config = next(iter([*folder.glob(f"{net}.sumocfg"), *folder.glob("run.sumocfg")]), None)
     files = ("-n", str(network), "-r", ",".join(map(str, types_first)))
-    start = Start(arguments=("-c", str(config)) if config.exists() else files, seed=3, dt=DT)
+    start = Start(arguments=files if config is None else ("-c", str(config)), seed=3, dt=DT)
     name, path = recorded(start, after=20.0, seconds=62.0)
     with SumoProcess(start) as process:
         handle, reading = until(process, name)
@@ -432,6 +432,19 @@ def test_files_that_sumo_refuses_are_one_line(nets: Path) -> None:
         SumoProcess(demand(nets, EAST + '<vehicle id="a" type="none" route="east" depart="0"/>')) as process,
     ):
         process.step(Orders())
+
+
+def test_outputs_of_a_scenario_do_not_litter_its_folder(nets: Path, tmp_path: Path) -> None:
+    start = demand(nets, CAR + EAST + '<vehicle id="a" type="car" route="east" depart="0"/>')
+    config = tmp_path / "out.sumocfg"
+    config.write_text(
+        f'<configuration><net-file value="{start.arguments[1]}"/><route-files value="{start.arguments[3]}"/>'
+        '<tripinfo-output value="trips.xml"/><log value="log.txt"/></configuration>'
+    )
+    for outputs, names in ((False, []), (True, ["log.txt", "trips.xml"])):
+        with SumoProcess(Start(arguments=("-c", str(config)), seed=0, dt=DT, outputs=outputs)) as process:
+            process.step(Orders())
+        assert sorted(x.name for x in tmp_path.iterdir() if x != config) == names
 
 
 def test_another_network_than_the_map_is_refused(nets: Path) -> None:

@@ -29,12 +29,15 @@ class Start:
       seed: of SUMO's random numbers.
       dt: s, length of a step.
       gui: show SUMO's window (`sumo-gui`).
+      outputs: write the files that the arguments and files ask for; otherwise they go to a folder that is
+        removed: worlds side by side would overwrite each other's.
     """
 
     arguments: tuple[str, ...]
     seed: int
     dt: float
     gui: bool = False
+    outputs: bool = False
 
 
 class Started(NamedTuple):

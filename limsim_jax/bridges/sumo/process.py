@@ -14,6 +14,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,6 +22,8 @@ import limsim_jax
 from limsim_jax.bridges.sumo.messages import Orders, Reading, Start, Started, SumoError
 
 _LENGTH = struct.Struct("<Q")  # bytes of the message that follows
+
+_UP = 64  # folders, more than any file lies deep
 
 PATIENCE = 5.0
 """s in which a child may end by itself before it is killed."""
@@ -40,6 +43,12 @@ class SumoProcess:
         self.start = start
         self.time = 0.0
         self._said = tempfile.TemporaryFile()
+        self._scratch = None if start.outputs else tempfile.TemporaryDirectory(prefix="limsim-sumo-")
+        if self._scratch is not None:
+            # a prefix stands behind the folder of each file; beyond the root there is no way up
+            prefix = "../" * _UP + self._scratch.name.lstrip("/") + "/"
+            more = ("--output-prefix", prefix, "--log", f"{self._scratch.name}/log.txt")
+            start = replace(start, arguments=(*start.arguments, *more))
         package = str(Path(limsim_jax.__file__).parents[1])
         path = os.pathsep.join(filter(None, (package, os.environ.get("PYTHONPATH"))))
         self.child = subprocess.Popen(
@@ -84,6 +93,8 @@ class SumoProcess:
             self.child.kill()
             self.child.wait()
         self._said.close()
+        if self._scratch is not None:
+            self._scratch.cleanup()
 
     def __enter__(self) -> SumoProcess:
         return self

@@ -69,7 +69,7 @@ def referee(world: World, *, fcd: str | Path | None = None) -> Verdict:
     runs = _Runs(world)
     found: dict[tuple[int, int], Collision] = {}
     echo = 0.0
-    with SumoProcess(Start(arguments=("-n", source, *record), seed=0, dt=dt)) as sumo:
+    with SumoProcess(Start(arguments=("-n", source, *record), seed=0, dt=dt, outputs=True)) as sumo:
         Places(network, world.map.lanes, sumo.there)
         before: set[int] = set()
         for t, time in enumerate(trace.time):
