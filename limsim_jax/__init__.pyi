@@ -16,6 +16,9 @@ from .api.sweep import sweep as sweep
 from .api.world import World as World
 from .bridges import carla as carla
 from .bridges.formats.export import export as export
+from .bridges.sumo.messages import SumoError as SumoError
+from .bridges.sumo.referee import referee as referee
+from .bridges.sumo.world import SumoWorld as SumoWorld
 from .bridges.traffic_service.client import TrafficClient as TrafficClient
 from .bridges.traffic_service.driver import DriverServer as DriverServer
 from .bridges.traffic_service.driver import remote_driver as remote_driver

@@ -45,6 +45,7 @@ NAMES = {
         "DriverServer",
         "remote_driver",
     ],
+    "Beside SUMO": ["SumoWorld", "referee", "SumoError"],
 }
 """Public names in the order of the page; all others follow as parts of the engine."""
 

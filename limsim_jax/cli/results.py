@@ -83,6 +83,22 @@ def sweep(
     address: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Ray cluster.  [default: this machine]")
     ] = None,
+    engine: Annotated[
+        Literal["limsim", "sumo"],
+        typer.Option(
+            help="What drives the other vehicles: limsim, or SUMO itself (a .sumocfg; extra 'sumo')."
+        ),
+    ] = "limsim",
+    ego: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ID[,ID]",
+            help="With SUMO: vehicles that the policy drives.  [default: drawn by the seed]",
+        ),
+    ] = None,
+    horizon: Annotated[
+        float | None, typer.Option(help="With SUMO: s that an ego has for its trip.  [default: 180]")
+    ] = None,
     on_error: Annotated[
         Literal["record", "stop"],
         typer.Option(help="An episode in which the policy fails is recorded as failed, or stops the sweep."),
@@ -106,7 +122,15 @@ def sweep(
         raise typer.BadParameter(f"{workers}; at least 1", param_hint="--workers")
     if fresh and part is not None:
         raise typer.BadParameter("it would remove the results of other shards", param_hint="--fresh")
-    experiments = read_experiments(experiment, map_file=map_file, policy=policy)
+    in_sumo = {"--ego": ego, "--horizon": horizon}
+    if engine == "sumo":
+        _not_with_sumo({"--map": map_file, "--workers": workers})
+        experiments: list[ExperimentFile] = []
+    else:
+        for name, value in in_sumo.items():
+            if value is not None:
+                raise typer.BadParameter("only with --engine sumo", param_hint=name)
+        experiments = read_experiments(experiment, map_file=map_file, policy=policy)
     folder = Path("results") / Path(experiment).stem if out is None else out
     begin = time.perf_counter()
 
@@ -115,7 +139,10 @@ def sweep(
     from limsim_jax.sweeps import runner
 
     kept: dict[tuple[str, str], int] = {}
-    made = build(experiments, chunk) if workers is None else []
+    if engine == "sumo":
+        made = [_sumo_episodes(experiment, policy, ego, horizon, chunk)]
+    else:
+        made = build(experiments, chunk) if workers is None else []
     try:
         with progress_bar() as show:
 
@@ -398,6 +425,27 @@ def build(
 
     use_all_cores(cores)
     return [Episodes(one, chunk=chunk) for one in experiments]
+
+
+def _not_with_sumo(options: dict[str, Any]) -> None:
+    for name, value in options.items():
+        if value is not None:
+            raise typer.BadParameter("not with --engine sumo", param_hint=name)
+
+
+def _sumo_episodes(
+    config: str, policy: str | None, ego: str | None, horizon: float | None, chunk: int | None
+) -> Any:
+    """The worlds of a `.sumocfg` that SUMO drives."""
+    from limsim_jax.bridges.sumo.world import HORIZON, SumoWorld
+
+    return SumoWorld(
+        config,
+        policy="limsim_tm" if policy is None else policy,
+        ego=None if ego is None else ego.split(","),
+        horizon=HORIZON if horizon is None else horizon,
+        chunk=chunk,
+    ).episodes
 
 
 def _group(results: Results, scenario: str | None, policy: str | None) -> tuple[str, str]:

@@ -72,8 +72,8 @@ AFTERWARDS = 12.0
 
 _BEGUN = "actions_begun"
 
-_NO_PART_OF_ROWS = ("api", "bench", "bench.py", "cli", "report")
-"""Rooms whose code changes no row."""
+_NO_PART_OF_ROWS = ("api", "bench", "bench.py", "bridges", "cli", "report")
+"""Rooms whose code changes no row; a bridge that does adds a hash of its own."""
 
 
 class Episodes:
@@ -284,47 +284,16 @@ class Episodes:
 
     def provenance(self) -> dict[str, Any]:
         """Where the rows come from."""
-        device = jax.local_devices()[0]
-        drivers, policy = self.experiment.traffic.drivers, self._values["policy"]
-        demand = files_of(self.experiment)
-        return {
-            **({"drivers": file_hash(Path(drivers).read_bytes())} if drivers is not None else {}),
-            **({"demand": {str(path): file_hash(path.read_bytes()) for path in demand}} if demand else {}),
-            **{name: describe(value) for name, value in self._values.items() if value and name != "policy"},
-            **({"policy": without_sources(describe(policy))} if policy is not None else {}),
-            **({"policy_code": self._code} if self._code else {}),
-            **({"knows": knows(self._policy)} if self.egos else {}),
-            **self._policies(),
-            "experiment": self.experiment.model_dump(mode="json", exclude={"map"}),
-            "map": {"file": os.path.basename(self.network.source), "hash": self.network.file_hash},
-            "map_file": self._map_file(),
-            "version": limsim_jax.__version__,
-            "source": _source_hash(),
-            "chunk": self.chunk,
-            "platform": device.platform,
-            "device": device.device_kind,
-            "devices": jax.local_device_count(),
-            "machine": platform.machine(),
-            "python": platform.python_version(),
-            "jax": jax.__version__,
-            "jaxlib": importlib.import_module("jaxlib").__version__,
+        about = provenance_of(
+            self.experiment, self.town.network, self._policy, self._values, self.chunk, self._code
+        )
+        return about | {
             "memory": {
                 "bytes_per_world": self.world_bytes,
                 "share_of_memory": _SHARE_OF_MEMORY,
                 "bytes_per_chunk": self.world_bytes * self.chunk,
             },
         }
-
-    def _policies(self) -> dict[str, list[str]]:
-        """The policies of egos that have one each."""
-        if not isinstance(self._policy, Several):
-            return {}
-        return {"policies": list(self._policy.names), "each_knows": [knows(x) for x in self._policy.policies]}
-
-    def _map_file(self) -> str:
-        """Where to find the map again: a bundled one by its name."""
-        name = self.experiment.map
-        return name if name in bundled_maps() else os.path.abspath(name)
 
     def compile(self) -> None:
         """Compile now; otherwise the first chunk does."""
@@ -344,7 +313,7 @@ class Episodes:
             egos=egos,
             metrics=metrics,
             moments=key_moments(rows, egos, metrics, self._reasons(rows, metrics)),
-            digest=_digest(metrics, result.state, each),
+            digest=digests(metrics, result.state, each),
         )
 
     def _columns(self, result: Result) -> dict[str, NDArray[np.float64]]:
@@ -360,7 +329,7 @@ class Episodes:
         metrics = {name: x.ravel() if x.ndim == 2 else np.repeat(x, each) for name, x in found.items()}
         if self.experiment.success:
             sound = metrics["policy_failed"] == 0 if "policy_failed" in metrics else True
-            metrics["success"] = _succeeds(metrics, self.experiment.success) * sound
+            metrics["success"] = succeeds(metrics, self.experiment.success) * sound
         return {name: metrics[name] for name in self.units}
 
     def _reasons(
@@ -444,6 +413,53 @@ class Episodes:
             one.moments[0]["module"] = self._reruns.module(seed, one.ego, one.metrics, kind, one.trace)
 
 
+def provenance_of(
+    experiment: ExperimentFile,
+    network: Network,
+    policy: PolicyLike,
+    values: Mapping[str, Any],
+    chunk: int,
+    code: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Where the rows of an experiment come from.
+
+    Args:
+      experiment: its tables.
+      network: the map.
+      policy: what drives the egos.
+      values: what Python gave instead of names.
+      chunk: worlds per call.
+      code: of a policy of one's own.
+    """
+    device = jax.local_devices()[0]
+    drivers, given = experiment.traffic.drivers, values["policy"]
+    demand = files_of(experiment)
+    each = policy if isinstance(policy, Several) else None
+    return {
+        **({"drivers": file_hash(Path(drivers).read_bytes())} if drivers is not None else {}),
+        **({"demand": {str(path): file_hash(path.read_bytes()) for path in demand}} if demand else {}),
+        **{name: describe(value) for name, value in values.items() if value and name != "policy"},
+        **({"policy": without_sources(describe(given))} if given is not None else {}),
+        **({"policy_code": code} if code else {}),
+        **({"knows": knows(policy)} if experiment.ego else {}),
+        **({"policies": list(each.names), "each_knows": [knows(x) for x in each.policies]} if each else {}),
+        "experiment": experiment.model_dump(mode="json", exclude={"map"}),
+        "map": {"file": os.path.basename(network.source), "hash": network.file_hash},
+        # where to find the map again: a bundled one by its name
+        "map_file": experiment.map if experiment.map in bundled_maps() else os.path.abspath(experiment.map),
+        "version": limsim_jax.__version__,
+        "source": _source_hash(),
+        "chunk": chunk,
+        "platform": device.platform,
+        "device": device.device_kind,
+        "devices": jax.local_device_count(),
+        "machine": platform.machine(),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "jaxlib": importlib.import_module("jaxlib").__version__,
+    }
+
+
 @cache
 def _source_hash() -> str:
     """Of all code, and weights, that make rows: rows of other code are other rows."""
@@ -456,7 +472,7 @@ def _source_hash() -> str:
     return hashed.hexdigest()[:16]
 
 
-def _succeeds(
+def succeeds(
     metrics: Mapping[str, NDArray[np.float64]], criteria: Mapping[str, bool | float | Bounds]
 ) -> NDArray[np.float64]:
     """1 where all criteria are met; a value that is missing meets none."""
@@ -472,7 +488,7 @@ def _succeeds(
     return good.astype(float)
 
 
-def _digest(metrics: Mapping[str, NDArray[np.float64]], state: Any, each: int) -> NDArray[np.uint64]:
+def digests(metrics: Mapping[str, NDArray[np.float64]], state: Any, each: int) -> NDArray[np.uint64]:
     """A hash of every world's rows and final state.
 
     It is the same for all `each` rows of a world."""

@@ -16,7 +16,7 @@ from limsim_jax.metrics.ego import EgoMetrics
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import encounter, overlaps
 from limsim_jax.sweeps import episode
-from limsim_jax.sweeps.episode import Episodes, _succeeds
+from limsim_jax.sweeps.episode import Episodes, succeeds
 from limsim_jax.sweeps.experiment import Bounds, ExperimentFile
 from limsim_jax.sweeps.moments import key_moments
 
@@ -262,6 +262,6 @@ def test_every_time_step_that_a_file_may_name_is_measured(dt):
 
 def test_success_is_what_the_file_says():
     metrics = {"arrived": np.array([1.0, 1, 0, 1]), "completion_time": np.array([20.0, 31, np.nan, 30])}
-    good = _succeeds(metrics, {"arrived": True, "completion_time": Bounds(max=30)})
+    good = succeeds(metrics, {"arrived": True, "completion_time": Bounds(max=30)})
     assert good.tolist() == [1, 0, 0, 1]
-    assert _succeeds(metrics, {"completion_time": Bounds(min=21)}).tolist() == [0, 1, 0, 1]
+    assert succeeds(metrics, {"completion_time": Bounds(min=21)}).tolist() == [0, 1, 0, 1]
