@@ -169,7 +169,7 @@ def sensor_speed(result: dict[str, Any]) -> str:
     bodies = result["boxes"] - result["lights"]
     rows += [
         "",
-        f"One core of {result['device']}, {result['worlds']} worlds at once, JAX {result['jax']}. Each frame "
+        f"One CPU core, {result['worlds']} worlds at once, JAX {result['jax']}. Each frame "
         f"has {result['boxes']} boxes: {bodies} vehicles and {result['lights']} lights.",
     ]
     return "\n".join(rows)

@@ -178,6 +178,23 @@ def test_tracking_is_that_of_a_loop_with_scipy(seed):
     assert int(score.switches) > 0 or seed
 
 
+def test_a_track_is_kept_while_another_is_nearer():
+    """One body; its track moves off by 1.5 m while a second one appears on the spot."""
+    zero = np.zeros((2, 1))
+    truth = {"there": zero == 0, "id": zero, "x": zero, "y": zero, "heading": zero, "score": zero}
+    truth |= {"length": zero + 4, "width": zero + 2}
+    pair = np.zeros((2, 2))
+    found = {name: pair for name in truth} | {"length": pair + 4, "width": pair + 2}
+    found |= {
+        "there": np.array([[1, 0], [1, 1]]),
+        "id": np.array([[7, 8], [7, 8]]),
+        "x": np.array([[0.5, 0], [1.5, 0.2]]),
+    }
+    score = _mot(boxes(found), boxes(truth), 1)
+    assert (int(score.switches), int(score.false), int(score.misses)) == (0, 1, 0)
+    assert float(score.motp) == pytest.approx(1.0)
+
+
 def test_a_perfect_tracker():
     _, truth = episode(1)
     every = boxes(truth)

@@ -39,7 +39,7 @@ def test_cells_are_where_things_are():
     near = [shapely.distance(s.exterior, shapely.points(x, y)) for s in shapes]
     edge = np.asarray(np.stack(near).min(0) < 1e-3)
     assert covers.any() and not edge.all()
-    np.testing.assert_array_equal(layer["occupied"][~edge] > 0, covers.any(0)[~edge])
+    np.testing.assert_array_equal(layer["occupied"][~edge] > 0, np.asarray(covers.any(0))[~edge])
     alone = covers.sum(0) == 1
     owner = covers.argmax(0)
     np.testing.assert_allclose(layer["vx"][alone], vx[owner[alone]])
