@@ -2,9 +2,9 @@
 
     python experiments/env_speed.py [--experiment ramp] [--seconds 20]
 
-`limsim_jax.bridges.gymnasium.VectorEnv` takes meta-actions drawn at random, for batches of 1, 16 and 128 worlds,
-with resets. Counted are decisions of environments per second, and vehicle-updates per second: vehicles on the
-road times physics steps. Starting and compiling do not count. One device, which is about one core on CPUs.
+`limsim_jax.bridges.gymnasium.VectorEnv` takes random meta-actions, for batches of 1, 16 and 128 worlds, with
+resets. Counted are decisions of environments per second, and vehicle-updates per second: vehicles on the road
+times physics steps. Starting and compiling do not count. One device, which is about one core on CPUs.
 Writes experiments/results/env_speed.json and .md.
 """
 
@@ -66,7 +66,7 @@ def main() -> None:
     lines = [
         "Regenerate: `python experiments/env_speed.py`",
         "",
-        "| worlds | decisions/s of all | vehicle-updates/s | vehicles on the road per world | start and compile, s |",
+        "| worlds | decisions/s of all | vehicle-updates/s | vehicles per world | start and compile, s |",
         "|---:|---:|---:|---:|---:|",
     ]
     for row in rows:

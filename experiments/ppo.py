@@ -1,4 +1,4 @@
-"""Learns to drive by proximal policy optimisation, in JAX from end to end.
+"""Learns to drive by proximal policy optimisation.
 
     python experiments/ppo.py highway                      # learns, and compares with the planners
     python experiments/ppo.py ramp
@@ -9,7 +9,8 @@ PPO (Schulman et al., 2017) with generalised advantages, over 128 worlds at once
 `lj.ObserveVector`, earns `lj.RouteReward` and chooses one of five meta-actions per decision. A rollout and
 its epochs of learning are one compiled program, divided among the cores. `Learned` is the result as a policy.
 
-Writes experiments/results/ppo_NAME.json (curve, comparison, times), .md, .png and .npz (weights).
+Writes experiments/results/ppo_NAME.json (curve, comparison, times), .md and .npz (weights), and the curve as
+docs/results/ppo_NAME.png.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ from limsim_jax.types import Status
 from limsim_jax.xla import enable_compilation_cache, run_often, use_all_cores
 
 RESULTS = Path(__file__).parent / "results"
+PICTURES = Path(__file__).parents[1] / "docs" / "results"
 ACTIONS = (Meta.KEEP, Meta.ACCELERATE, Meta.DECELERATE, Meta.LEFT, Meta.RIGHT)
 FIRST_SEED = 1_000_000
 """Of training; sweeps start at 0, with worlds that the network has not seen."""
@@ -277,8 +279,8 @@ def update_of(env: lj.Env, settings: Settings, optimiser: Any, mesh: Mesh) -> Ca
     return jax.jit(shared, donate_argnums=(0, 1, 2), compiler_options=run_often())
 
 
-def learn(experiment: lj.Experiment, settings: Settings, minutes: float, tell: Callable[[str], None]) -> Any:
-    """Learn for a time; returns weights, the curve, and s of compiling."""
+def learn(experiment: lj.Experiment, settings: Settings, steps: int, tell: Callable[[str], None]) -> Any:
+    """Learn from a number of decisions; returns weights, the curve, and s of compiling."""
     env = lj.Env(
         experiment, action="meta", observe=lj.ObserveVector(), reward=lj.RouteReward(),
         ends=Status.COLLIDED | Status.OFF_ROAD | Status.RED_LIGHT,
@@ -302,8 +304,9 @@ def learn(experiment: lj.Experiment, settings: Settings, minutes: float, tell: C
     tell(f"compiled in {compiled:.0f} s")
     begun, cpu = time.perf_counter(), time.process_time()
     curve, spent, n = [], 0.0, 0
-    while spent < 60 * minutes:
-        rate = np.float32(settings.rate * max(1 - spent / (60 * minutes), 0.0))
+    updates = -(-steps // (settings.steps * settings.worlds))
+    while n < updates:
+        rate = np.float32(settings.rate * (1 - n / updates))
         slopes[1].hyperparams["learning_rate"] = jax.device_put(rate, everywhere)
         now = jax.device_put(jax.random.fold_in(key, n + 2), everywhere)
         weights, slopes, worlds, told = update(weights, slopes, worlds, now)
@@ -325,17 +328,18 @@ def learn(experiment: lj.Experiment, settings: Settings, minutes: float, tell: C
 
 
 def recent(curve: list[dict[str, Any]]) -> NDArray[np.float64]:
-    """Share of the egos that arrived, of those that ended in the last `RECENT` updates."""
+    """Share of arrivals among the ends of the last `RECENT` updates; NaN: none."""
     arrived, ended = (np.cumsum([0] + [row[name] for row in curve]) for name in ("arrived", "ended"))
     first = np.maximum(np.arange(len(curve)) + 1 - RECENT, 0)
-    return (arrived[1:] - arrived[first]) / np.maximum(ended[1:] - ended[first], 1)
+    count = ended[1:] - ended[first]
+    return np.where(count > 0, (arrived[1:] - arrived[first]) / np.maximum(count, 1), np.nan)
 
 
 # --- comparison --------------------------------------------------------------------------------------
 
 
 def selfplay_experiment() -> lj.Experiment:
-    """Four egos that want to merge and to drive on, in the traffic of the ramp."""
+    """Four egos at the ramp: two merge, two drive on."""
     merging = [lj.Ego(start="5", s=s, goal="3") for s in (250.0, 200.0)]
     passing = [lj.Ego(start="1", lane=lane, s=s, goal="3") for lane, s in ((1, 300.0), (2, 250.0))]
     return lj.Experiment("ramp", name="selfplay", ego=[*merging, *passing])
@@ -439,7 +443,7 @@ def main() -> None:
     """Learn, compare, and write."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("experiment", choices=list(EXPERIMENTS))
-    parser.add_argument("--minutes", type=float, default=7.0, help="of learning")
+    parser.add_argument("--steps", type=int, default=300_000, help="decisions to learn from")
     parser.add_argument("--seeds", type=int, default=200, help="of the comparison")
     parser.add_argument("--compare", action="store_true", help="with the weights that are there")
     told = parser.parse_args()
@@ -451,14 +455,14 @@ def main() -> None:
         report = json.loads(path.with_suffix(".json").read_text())
     else:
         settings = Settings()
-        weights, curve, compiled = learn(make(), settings, told.minutes, lambda line: print(line, flush=True))
+        weights, curve, compiled = learn(make(), settings, told.steps, lambda line: print(line, flush=True))
         save(path.with_suffix(".npz"), weights)
         load.cache_clear()
         report = {
             "experiment": name, "goal": goal, "devices": devices, "compile_s": round(compiled, 1),
             "settings": asdict(settings), "policies": [], "curve": curve,
         }  # fmt: skip
-        draw(path.with_suffix(".png"), name, curve)
+        draw(PICTURES / f"ppo_{name}.png", name, curve)
     if told.seeds:
         report["policies"] = compare(make(), policy(), told.seeds)
     write_whole(path.with_suffix(".json"), json.dumps(report, indent=1) + "\n")

@@ -33,7 +33,7 @@ NAMES = {
         *("Policy", "HostPolicy", "Observation", "Command", "Control", "Trajectory"),
         *("reference_path", "to_cartesian"),
     ],
-    "Step by step": ["Env"],
+    "Step by step": ["Env", "ObserveVector", "RouteReward"],
     "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "Population", "default_population"],
     "Log replay": ["load_scene", "Scene"],
 }

@@ -330,13 +330,13 @@ class Env:
 
 
 def _status(before: State, after: State) -> Array:
-    """Bits of `Status` of the egos `[E]`, also of those that have just left."""
+    """Bits of `Status` of the egos `[E]`, gone or not."""
     slot = before.egos.slot
     return jnp.where(after.active[slot], after.status[slot], after.status[slot] | before.status[slot])
 
 
 def _closing(lane_map: LaneMap, state: State) -> Array:
-    """Whether bodies of egos `[E]` touch another within `CLOSING` s at constant speed and heading."""
+    """Whether egos `[E]` touch another body within `CLOSING` s, going straight on."""
     slot = state.egos.slot
     times = CLOSING * jnp.arange(1, _MOMENTS + 1, dtype=state.v.dtype) / _MOMENTS
     ahead = constant_velocity(lane_map, state, times)

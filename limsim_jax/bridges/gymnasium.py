@@ -78,7 +78,7 @@ def register() -> None:
 
 
 class _Worlds:
-    """The worlds behind an environment, and what Gymnasium has to know of them."""
+    """The worlds behind an environment, with their seeds."""
 
     def __init__(self, env: PureEnv, count: int) -> None:
         self.env, self.programs = env, _programs(env, count)
@@ -247,7 +247,7 @@ class Env(gymnasium.Env[NDArray[np.float32], Any]):
             raise ValueError("step: call reset first")
         chosen = _checked_action(action, self.action_space, self.action_space.shape or ())
         seen, reward, over, late, info = self._worlds.step(chosen[None])
-        told = {name: x[0] for name, x in info.items()}
+        told = {name: x[0].item() for name, x in info.items()}
         return seen[0], float(reward[0]), bool(over[0]), bool(late[0]), told
 
     def render(self) -> Any:
@@ -392,7 +392,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], Any, NDArray[Any
 
 
 def _masked(info: dict[str, NDArray[Any]], there: NDArray[np.bool_]) -> dict[str, Any]:
-    """Infos of the environments that are `there`, zeros elsewhere, each with its mask."""
+    """Infos with their masks, zeros where not `there`."""
     if not there.any():
         return {}
     infos: dict[str, Any] = {}

@@ -138,7 +138,7 @@ def episode_key(seed: Int[Array, ""], episode: Int[Array, ""]) -> Array:
 
 
 class Stepped(NamedTuple):
-    """What a decision of `n` worlds brings, `[n, E]` where not said otherwise."""
+    """`n` worlds after a decision; `[n, E]` where not said otherwise."""
 
     states: EnvState
     seen: Any  # [n, E, ...]

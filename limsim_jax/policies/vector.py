@@ -113,7 +113,7 @@ class ObserveVector:
 
 
 def may_change(lane_map: LaneMap, state: State) -> Bool[Array, "E 2"]:
-    """Whether an ego may start a change to the left and to the right, by marks and kind of lane."""
+    """Whether marks and lanes allow a change to the left, right."""
     kept = replace(state, egos=replace(state.egos, free=jnp.zeros_like(state.egos.free)))
     every = jnp.zeros_like(state.egos.slot)
     sides = (meta_lane(lane_map, kept, every + int(meta)) for meta in (Meta.LEFT, Meta.RIGHT))

@@ -126,7 +126,7 @@ class Scene:
         self.show(trace)
 
     def show(self, trace: Trace) -> None:
-        """Take the vehicles and signals of a trace on the host, with as many slots."""
+        """Take another trace of as many slots, on the host."""
         self.time = np.asarray(trace.time)
         self.v, self.vehicle = trace.v, trace.vehicle
         self.active = np.asarray(trace.active, bool)
