@@ -67,12 +67,8 @@ def test_vectors_show_what_a_loop_finds():
 @pytest.mark.engine
 def test_who_is_gone_sees_zeros_and_broken_numbers_stay_within():
     lane_map, state = world(egos=(2, 5))
-    state = dataclasses.replace(
-        state,
-        active=state.active.at[2].set(False),
-        v=state.v.at[5].set(jnp.inf),
-        d=state.d.at[5].set(jnp.nan),
-    )
+    egos = dataclasses.replace(state.egos, a=jnp.full(2, jnp.inf, jnp.float32))
+    state = dataclasses.replace(state, active=state.active.at[2].set(False), egos=egos)
     seen = np.asarray(ObserveVector(nearest=30)(CONFIG, lane_map, state))
     assert (seen[0] == 0).all() and np.isfinite(seen).all() and (np.abs(seen) <= 1).all()
     others = parts(seen[1], ObserveVector(nearest=30))[2]
