@@ -198,7 +198,7 @@ def rollout(env: lj.Env, settings: Settings, weights: Any, worlds: Worlds, key: 
             jax.random.split(key, count), worlds.state, {"meta": meta}
         )
         # the horizon cuts an episode short: what would have come is worth its value
-        _, beyond = ActorCritic().apply(weights, seen)
+        beyond: Any = ActorCritic().apply(weights, seen)[1]
         reward = reward + settings.discount * jnp.where(late[:, None] & ~over, beyond, 0.0)
         done = late | over.all(-1)
         moment = Moment(
@@ -241,7 +241,7 @@ def loss(settings: Settings, weights: Any, moments: Moment, gain: Any, target: A
     return jnp.sum(each * moments.counts) / jnp.maximum(moments.counts.sum(), 1.0)
 
 
-def update_of(env: lj.Env, settings: Settings, optimiser: Any, mesh: Mesh) -> Callable[..., Any]:
+def update_of(env: lj.Env, settings: Settings, optimiser: Any, mesh: Mesh) -> Any:
     """A rollout and its epochs of learning, divided among the devices."""
 
     def update(weights: Any, slopes: Any, worlds: Worlds, key: Any) -> Any:
@@ -353,9 +353,8 @@ EXPERIMENTS = {
 """What to learn: an experiment, the policy that comes of it, and the success to reach."""
 
 
-def compare(experiment: lj.Experiment, policy: Learned, seeds: int) -> list[dict[str, Any]]:
+def compare(experiment: lj.Experiment, policies: list[lj.Policy], seeds: int) -> list[dict[str, Any]]:
     """What a sweep says of the network and of the planners."""
-    policies = [policy, lj.LikeTraffic(), lj.PDMClosed(), lj.LimSimTM()]
     results = lj.sweep(experiment, policies=policies, seeds=seeds, progress=False)
     rows = []
     for name in results.policies:
@@ -446,6 +445,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=300_000, help="decisions to learn from")
     parser.add_argument("--seeds", type=int, default=200, help="of the comparison")
     parser.add_argument("--compare", action="store_true", help="with the weights that are there")
+    parser.add_argument("--alone", action="store_true", help="drive the network without the planners")
     told = parser.parse_args()
     devices = use_all_cores()
     enable_compilation_cache()
@@ -464,7 +464,8 @@ def main() -> None:
         }  # fmt: skip
         draw(PICTURES / f"ppo_{name}.png", name, curve)
     if told.seeds:
-        report["policies"] = compare(make(), policy(), told.seeds)
+        others = [] if told.alone else [lj.LikeTraffic(), lj.PDMClosed(), lj.LimSimTM()]
+        report["policies"] = compare(make(), [policy(), *others], told.seeds)
     write_whole(path.with_suffix(".json"), json.dumps(report, indent=1) + "\n")
     write_whole(path.with_suffix(".md"), table(report))
     print(table(report))

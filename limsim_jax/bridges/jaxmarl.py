@@ -86,11 +86,11 @@ def multi_agent_env(
         def by_agent(self, rows: Any) -> dict[str, Any]:
             return {name: rows[k] for k, name in enumerate(self.agents)}
 
-        def reset(self, key: Any) -> Any:
+        def reset(self, key: Any) -> Any:  # pyright: ignore
             obs, state = core.reset(key)
             return self.by_agent(obs), state
 
-        def step_env(self, key: Any, state: EnvState, actions: Any) -> Any:
+        def step_env(self, key: Any, state: EnvState, actions: Any) -> Any:  # pyright: ignore
             rows = jnp.stack([jnp.asarray(actions[name]) for name in self.agents])
             obs, state, reward, over, late, info = core.step(key, state, named_action(core, rows))
             dones = {**self.by_agent(over | late), "__all__": over.all() | late}
@@ -99,10 +99,10 @@ def multi_agent_env(
             infos |= {"time": every * info.time, "truncated": every & late}
             return self.by_agent(obs), state, self.by_agent(reward), dones, infos
 
-        def get_obs(self, state: EnvState) -> Any:
+        def get_obs(self, state: EnvState) -> Any:  # pyright: ignore
             return self.by_agent(state.seen)
 
-        def get_avail_actions(self, state: EnvState) -> Any:
+        def get_avail_actions(self, state: EnvState) -> Any:  # pyright: ignore
             if not isinstance(bounds, int):
                 return self.by_agent(jnp.ones((core.egos, 1), bool))
             return self.by_agent(available(core, state))
