@@ -360,9 +360,9 @@ def compare(experiment: lj.Experiment, policies: list[lj.Policy], seeds: int) ->
     for name in results.policies:
         table = results.episodes.filter(np.asarray(results.episodes.column("policy")) == name)
         column = {
-            x: np.asarray(table.column(x), float) for x in ("success", "contacts", "left_road", "distance")
+            x: np.asarray(table.column(x), float) for x in ("success", "contacts", "off_road", "distance")
         }
-        bad = int(((column["contacts"] > 0) | (column["left_road"] > 0)).sum())
+        bad = int(((column["contacts"] > 0) | (column["off_road"] > 0)).sum())
         km = float(column["distance"].sum() / 1000)
         rate = poisson_rate(bad, km)
         done = wilson(int(column["success"].sum()), len(column["success"]))
