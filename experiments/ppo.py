@@ -94,13 +94,15 @@ class ActorCritic(nn.Module):
 
 @dataclass(frozen=True)
 class Learned(lj.Policy):
-    """Drives by the likeliest action of a network.
+    """Drives by the actions of a network.
 
     Attributes:
       weights: file of `save`.
+      greedy: takes the likeliest action; otherwise it draws one, as while learning.
     """
 
     weights: str = str(RESULTS / "ppo_highway.npz")
+    greedy: bool = False
 
     free = False
 
@@ -109,15 +111,15 @@ class Learned(lj.Policy):
 
     def __call__(self, config: Any, lane_map: Any, state: Any, memory: Any, key: Any) -> Any:
         """A meta-action per ego."""
-        del key
         logits, _ = ActorCritic().apply(load(self.weights), lj.ObserveVector()(config, lane_map, state))
-        meta = jnp.asarray([int(x) for x in ACTIONS], jnp.int32)[logits.argmax(-1)]
+        action = logits.argmax(-1) if self.greedy else jax.random.categorical(key, logits)
+        meta = jnp.asarray([int(x) for x in ACTIONS], jnp.int32)[action]
         return lj.Command(meta=meta), memory
 
 
 def highway() -> Learned:
     """What has learned on the motorway."""
-    return Learned(name="ppo")
+    return Learned(greedy=True, name="ppo")
 
 
 def ramp() -> Learned:
