@@ -1,4 +1,5 @@
 from .api.env import Env as Env
+from .api.env import RouteReward as RouteReward
 from .api.experiment import Action as Action
 from .api.experiment import Ego as Ego
 from .api.experiment import Experiment as Experiment
@@ -46,6 +47,7 @@ from .policies.reference import reference_path as reference_path
 from .policies.reference import to_cartesian as to_cartesian
 from .policies.simple import ConstantSpeed as ConstantSpeed
 from .policies.simple import FollowLane as FollowLane
+from .policies.vector import ObserveVector as ObserveVector
 from .policies.view import View as View
 from .report import plots as plots
 from .sensors.objects import Detector as Detector

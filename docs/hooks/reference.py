@@ -34,7 +34,7 @@ NAMES = {
         *("reference_path", "to_cartesian"),
     ],
     "Sensors": ["Camera", "Lidar", "Rig", "six_cameras", "Detector", "Sensed"],
-    "Step by step": ["Env"],
+    "Step by step": ["Env", "ObserveVector", "RouteReward"],
     "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "Population", "default_population"],
     "Log replay": ["load_scene", "Scene"],
     "Beside other tools": [

@@ -13,10 +13,14 @@ from flax import struct
 from jaxtyping import Array, Float, Key
 
 from limsim_jax.api.experiment import Experiment
+from limsim_jax.geometry import boxes_overlap
 from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.maps.map import Map
 from limsim_jax.policies.host import Kind, Observation, Observe, command_from
+from limsim_jax.policies.predict import constant_velocity, nearest
 from limsim_jax.policies.view import view_of
 from limsim_jax.simulation.rollout import Carry, Rollout
+from limsim_jax.standards import COMFORT
 from limsim_jax.sweeps.experiment import ExperimentError
 from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.script import lanes_now
@@ -34,7 +38,9 @@ class EnvState:
     schedule: Schedule
     sight: Any  # what the view of the egos remembers, None without one
     key: Key[Array, ""]  # of the world
-    ended: Array  # [E], the ego has collided, left the road or arrived, or its action was broken
+    ended: Array  # [E], the ego has arrived, its action was broken, or something of `ends` has happened to it
+    route: Float[Array, " E"]  # m from its start to its goal; NaN without a way there
+    seen: Any  # the last observation of the egos
 
     @property
     def world(self) -> State:
@@ -51,10 +57,26 @@ class Info(NamedTuple):
     arrived: Array  # bool
     broken: Array  # bool, an action so far was not finite
     time: Float[Array, ""]  # s
+    red_light: Array  # bool, crossed a stop line on red so far
+    route: Float[Array, " E"]  # m from the start to the goal; NaN without a way there
+    speed: Float[Array, " E"]  # m/s
+    limit: Float[Array, " E"]  # m/s, of the lane
+    acceleration: Float[Array, " E"]  # m/s^2 along the road, mean of the step
+    closing: Array  # bool, in contact with another within `CLOSING` s if both keep speed and heading
+    terms: dict[str, Array] = {}  # noqa: RUF012 - of the reward, [E] each
 
 
-Reward = Callable[[Info, Info], Float[Array, " E"]]
-"""From what the step before said, and this step, to a reward per ego."""
+Reward = Callable[[Info, Info], Float[Array, " E"] | tuple[Float[Array, " E"], dict[str, Array]]]
+"""From what the step before said, and this step, to a reward per ego.
+
+With a dictionary of its terms beside it, they stand in `Info.terms`.
+"""
+
+CLOSING = 0.95
+"""s, least time to collision (nuPlan, `time_to_collision_within_bound`)."""
+
+_MOMENTS = 4  # at which bodies are compared within that time
+_OTHERS = 8  # nearest vehicles that are compared
 
 
 @dataclass(frozen=True)
@@ -85,6 +107,49 @@ class ProgressReward:
         )
 
 
+@dataclass(frozen=True)
+class RouteReward:
+    """Route completion times soft penalties, less a penalty for infractions.
+
+    After CaRL (Jaeger et al., 2025, arXiv 2504.17838): one term to maximise. The share of the route that is
+    driven in a step is multiplied by a factor for each of three soft penalties; all are 1 while the driving
+    is sound. A collision, a departure from the road, a red light and a broken action cost `penalty` once.
+
+    The terms are `completion` (share of the route), `speeding`, `comfort`, `closing` (factors) and
+    `infraction` (0 or 1).
+
+    Attributes:
+      scale: reward of a whole route.
+      penalty: of an infraction.
+      over: m/s above the limit at which nothing is left (nuPlan, `max_overspeed_value_threshold`).
+      soft: factor of a step that is uncomfortable, by nuPlan's bounds of the acceleration, or in which the
+        ego closes in on another vehicle, `Info.closing`.
+    """
+
+    scale: float = 10.0
+    penalty: float = 5.0
+    over: float = 2.23
+    soft: float = 0.5
+
+    def __call__(self, before: Info, now: Info) -> tuple[Float[Array, " E"], dict[str, Array]]:
+        """The reward of a step `[E]`, and its terms."""
+        known = jnp.isfinite(now.route) & (now.route > 0)
+        completion = jnp.where(known, now.progress / jnp.where(known, now.route, 1.0), 0.0)
+        speeding = 1.0 - jnp.clip((now.speed - now.limit) / self.over, 0.0, 1.0)
+        least, most = COMFORT["acceleration"]
+        rough = (now.acceleration < least) | (now.acceleration > most)
+        comfort = jnp.where(rough, self.soft, 1.0)
+        closing = jnp.where(now.closing, self.soft, 1.0)
+        infraction = jnp.zeros_like(now.collided)
+        for name in ("collided", "off_road", "red_light", "broken"):
+            infraction |= getattr(now, name) & ~getattr(before, name)
+        terms = {"completion": completion, "speeding": speeding, "comfort": comfort, "closing": closing}
+        terms["infraction"] = infraction.astype(completion.dtype)
+        # standing still or rolling back earns no more for being rough
+        good = jnp.where(completion > 0, speeding * comfort * closing, 1.0)
+        return self.scale * completion * good - self.penalty * terms["infraction"], terms
+
+
 class Env:
     """An experiment as reset and step; the egos do what the actions say, all others drive as traffic.
 
@@ -113,6 +178,7 @@ class Env:
       observe: makes the observation of what the egos see; any `(config, lane_map, state) -> pytree`.
       reward: from two `Info`s to a reward per ego.
       sample_time: s between samples of trajectories.
+      ends: bits of `Status` that end the episode of an ego.
 
     Raises:
       ExperimentError: an experiment that cannot run or has no ego.
@@ -127,6 +193,7 @@ class Env:
         observe: Callable[[Config, LaneMap, State], Any] | None = None,
         reward: Reward | None = None,
         sample_time: float = 0.1,
+        ends: Status = Status.COLLIDED | Status.OFF_ROAD,
     ) -> None:
         if action not in get_args(Kind):
             raise ValueError(f"action: '{action}'; known are {', '.join(get_args(Kind))}")
@@ -135,6 +202,7 @@ class Env:
             raise ExperimentError(f"{self.experiment.name}: ego: an environment needs at least one")
         self.action: Kind = action
         self.sample_time = sample_time
+        self.ends = ends
         self.observe = Observe() if observe is None else observe
         self.reward: Reward = ProgressReward() if reward is None else reward
         ego = self.experiment.file.ego[0]
@@ -147,6 +215,11 @@ class Env:
         self.config = self._run.config
         if self._view is not None:
             self._view.late(self.config)
+
+    @property
+    def map(self) -> Map:
+        """Where it happens."""
+        return self._episodes.town
 
     @property
     def horizon(self) -> int:
@@ -169,8 +242,15 @@ class Env:
         carry = self._run.init(self.lanes, start)._replace(memory=empty)
         sight = None if self._view is None else self._view.init(self.config, carry.state)
         seen, sight = self._look(carry.state, scenario.schedule, sight, own)
-        nothing = jnp.zeros(self.egos, bool)
-        state = EnvState(carry=carry, schedule=scenario.schedule, sight=sight, key=own, ended=nothing)
+        state = EnvState(
+            carry=carry,
+            schedule=scenario.schedule,
+            sight=sight,
+            key=own,
+            ended=jnp.zeros(self.egos, bool),
+            route=self._to_go(carry.state),
+            seen=seen,
+        )
         return seen, state
 
     def step(
@@ -192,12 +272,17 @@ class Env:
         carry = state.carry._replace(memory=command)
         _, after = self._run.advance(self.lanes, state.schedule, state.key, carry, 1)
         after = after._replace(memory=Command())
-        last, now = self._info(before, before), self._info(before, after.state)
-        over = state.ended | now.collided | now.off_road | now.arrived | now.broken
-        reward = jnp.where(state.ended, 0.0, self.reward(last, now))
+        last = self._info(before, before, state.route)
+        now = self._info(before, after.state, state.route)
+        ends = (_status(before, after.state) & int(self.ends)) != 0
+        over = state.ended | ends | now.arrived | now.broken
+        found = self.reward(last, now)
+        reward, terms = found if isinstance(found, tuple) else (found, {})
+        now = now._replace(terms=terms)
+        reward = jnp.where(state.ended, 0.0, reward)
         truncated = after.state.step >= self._run.decisions * self.config.decision_every
         seen, sight = self._look(after.state, state.schedule, state.sight, state.key)
-        new = EnvState(carry=after, schedule=state.schedule, sight=sight, key=state.key, ended=over)
+        new = replace(state, carry=after, sight=sight, ended=over, seen=seen)
         return seen, new, reward, over, truncated, now
 
     def _look(self, state: State, schedule: Schedule, sight: Any, key: Key[Array, ""]) -> tuple[Any, Any]:
@@ -208,21 +293,32 @@ class Env:
             state, sight = self._view.look(self.config, lanes, state, sight, now)
         return self.observe(self.config, lanes, state), sight
 
-    def _info(self, before: State, after: State) -> Info:
+    def _info(self, before: State, after: State, route: Float[Array, " E"]) -> Info:
         """Of the egos, between two states."""
         slot = before.egos.slot
-        status = jnp.where(after.active[slot], after.status[slot], after.status[slot] | before.status[slot])
+        status = _status(before, after)
         gone = before.active[slot] & ~after.active[slot]
-        bits = (Status.COLLIDED, Status.OFF_ROAD, Status.NOT_FINITE)
-        collided, off_road, broken = ((status & int(bit)) != 0 for bit in bits)
+        bits = (Status.COLLIDED, Status.OFF_ROAD, Status.NOT_FINITE, Status.RED_LIGHT)
+        collided, off_road, broken, red_light = ((status & int(bit)) != 0 for bit in bits)
         ahead = self._to_go(before) - jnp.where(gone, 0.0, self._to_go(after))
+        # another goal, for a vehicle that missed its way, is no progress
+        ahead = jnp.where(gone | (before.goal[slot] == after.goal[slot]), ahead, 0.0)
+        there = after.active[slot]
+        speed = jnp.where(there, after.v[slot], before.v[slot])
+        lasted = jnp.maximum(self.config.time(after.step - before.step), self.config.dt)
         return Info(
             progress=jnp.where(jnp.isfinite(ahead), ahead, 0.0),
             collided=collided,
             off_road=off_road,
-            arrived=~after.active[slot] & ~collided,
+            arrived=~there & ~collided,
             broken=broken,
             time=self.config.time(after.step),
+            red_light=red_light,
+            route=route,
+            speed=speed,
+            limit=self.lanes.speed_limit[jnp.where(there, after.lane[slot], before.lane[slot])],
+            acceleration=(speed - before.v[slot]) / lasted,
+            closing=_closing(self.lanes, after) & there,
         )
 
     def _to_go(self, state: State) -> Float[Array, " E"]:
@@ -231,6 +327,30 @@ class Env:
         lane, goal, routes = state.lane[slot], state.goal[slot], self.lanes.routes
         known = state.active[slot] & (lane >= 0) & routes.reachable[lane, goal]
         return jnp.where(known, routes.distance[lane, goal] - state.s[slot], jnp.nan)
+
+
+def _status(before: State, after: State) -> Array:
+    """Bits of `Status` of the egos `[E]`, gone or not."""
+    slot = before.egos.slot
+    return jnp.where(after.active[slot], after.status[slot], after.status[slot] | before.status[slot])
+
+
+def _closing(lane_map: LaneMap, state: State) -> Array:
+    """Whether egos `[E]` touch another body within `CLOSING` s, going straight on."""
+    slot = state.egos.slot
+    times = CLOSING * jnp.arange(1, _MOMENTS + 1, dtype=state.v.dtype) / _MOMENTS
+    ahead = constant_velocity(lane_map, state, times)
+    near = nearest(lane_map, state, ahead, slot, _OTHERS)  # [E, K]
+
+    def boxes(slots: Array) -> Array:  # [*slots, H, 5]
+        size = jnp.stack([ahead.length[slots], ahead.width[slots]], -1)
+        pose = jnp.stack([ahead.x[slots], ahead.y[slots], ahead.heading[slots]], -1)
+        return jnp.concatenate([pose, jnp.broadcast_to(size[..., None, :], (*pose.shape[:-1], 2))], -1)
+
+    others = boxes(near)
+    own = jnp.broadcast_to(boxes(slot)[:, None], others.shape)
+    touch = jax.vmap(boxes_overlap)(own.reshape(-1, 5), others.reshape(-1, 5)).reshape(others.shape[:-1])
+    return (touch & (near >= 0)[..., None]).any((-1, -2))
 
 
 @dataclass(frozen=True)
@@ -253,4 +373,4 @@ class _Commanded:
         return memory, memory
 
 
-__all__ = ["Env", "EnvState", "Info", "Observation", "ProgressReward"]
+__all__ = ["Env", "EnvState", "Info", "Observation", "ProgressReward", "RouteReward"]

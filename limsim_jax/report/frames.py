@@ -109,32 +109,38 @@ class Scene:
         self, network: Network, lane_map: LaneMap, trace: Trace, egos: Sequence[int] | set[int]
     ) -> None:
         trace = jax.device_get(trace)
-        self.time = np.asarray(trace.time)
-        if self.time.ndim != 1 or not self.time.size:
-            raise ValueError("the trace is empty" if self.time.ndim else "the trace has no axis of time")
+        times = np.asarray(trace.time)
+        if times.ndim != 1 or not times.size:
+            raise ValueError("the trace is empty" if times.ndim else "the trace has no axis of time")
         slots = trace.active.shape[1]
         for ego in egos:
             if not 0 <= ego < slots:
                 raise ValueError(f"slot {ego}: the trace has slots 0 to {slots - 1}")
-        self.v, self.vehicle = trace.v, trace.vehicle
-        self.active = np.asarray(trace.active, bool)
+        self.lane_map = lane_map
         self.ends = {ego: ending(trace, ego) for ego in egos}
-        self.plans_of = None if trace.driven is None else trace.driven  # [T, E], slots
-        self.plan_xy = (
-            None
-            if trace.plan is None
-            else np.stack(absolute(lane_map, trace.plan[..., 0], trace.plan[..., 1]), -1)
-        )
-        x, y = absolute(lane_map, trace.box[..., 0], trace.box[..., 1])
-        self.xy = np.stack([x, y], -1)  # [T, N, 2]
-        self.heading, self.size = trace.box[..., 2], trace.box[..., 3:]
-        self.collided = (trace.status & int(Status.COLLIDED)) != 0
         self.ego = np.isin(np.arange(slots), list(egos))
         self.egos_first = np.argsort(self.ego, kind="stable")  # drawn last, so on top
         limits = [lane.speed_limit for lane in network.drivable_lanes()]
         self.top_speed = 5.0 * math.ceil(max(limits, default=10.0) / 5.0)  # m/s
-        self.bars, rows = signal_bars(network, lane_map)  # [B, 2, 2]
-        self.signals = lane_states_on_host(lane_map.signals, trace.phase)[:, rows]  # [T, B]
+        self.bars, self.bar_rows = signal_bars(network, lane_map)  # [B, 2, 2]
+        self.show(trace)
+
+    def show(self, trace: Trace) -> None:
+        """Take another trace of as many slots, on the host."""
+        self.time = np.asarray(trace.time)
+        self.v, self.vehicle = trace.v, trace.vehicle
+        self.active = np.asarray(trace.active, bool)
+        self.plans_of = None if trace.driven is None else trace.driven  # [T, E], slots
+        self.plan_xy = (
+            None
+            if trace.plan is None
+            else np.stack(absolute(self.lane_map, trace.plan[..., 0], trace.plan[..., 1]), -1)
+        )
+        x, y = absolute(self.lane_map, trace.box[..., 0], trace.box[..., 1])
+        self.xy = np.stack([x, y], -1)  # [T, N, 2]
+        self.heading, self.size = trace.box[..., 2], trace.box[..., 3:]
+        self.collided = (trace.status & int(Status.COLLIDED)) != 0
+        self.signals = lane_states_on_host(self.lane_map.signals, trace.phase)[:, self.bar_rows]  # [T, B]
 
     def outlines(self, k: int, scale: float) -> tuple[NDArray[Any], NDArray[Any]]:
         """Slots on the road, and their polygons `[M, 6, 2]` times `scale`."""

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.outline import Bounds, outlines, view
 from limsim_jax.metrics.moments import value_text, words
@@ -20,6 +21,7 @@ from limsim_jax.report.draw.layout import strips
 from limsim_jax.report.draw.painter import INK
 from limsim_jax.report.frames import Layer, Scene, draw_map_only
 from limsim_jax.report.pictures import OTHER
+from limsim_jax.simulation.trace import Trace
 
 DPI = 100
 """Dots per inch of a video; a page is 12.8 x 7.2 inches."""
@@ -264,6 +266,32 @@ class Camera:
             for text in (self.clock, self.caption) if caption else (self.clock,):
                 self.figure.draw_artist(text)
             yield _even(pixels[..., :3])
+
+
+class LiveCamera:
+    """A camera above a vehicle of a world that is still running.
+
+    Args:
+      network: the map.
+      lane_map: of that map.
+      trace: of one step, `[1, ...]`.
+      slot: of the vehicle.
+      dpi: dots per inch of a page of 12.8 x 7.2 inches.
+    """
+
+    def __init__(
+        self, network: Network, lane_map: LaneMap, trace: Trace, slot: int, dpi: float = 0.75 * DPI
+    ) -> None:
+        scene = Scene(network, lane_map, trace, [slot])
+        self._camera = Camera(network, scene, Captions(scene, ()), slot, 0.0, dpi)
+
+    def frame(self, trace: Trace) -> NDArray[np.uint8]:
+        """Pixels `[H, W, 3]` of a step, `[1, ...]`; the view stays where the vehicle was last."""
+        camera = self._camera
+        camera.scene.show(trace)
+        if camera.scene.active[0, camera.slot]:
+            camera.places = camera.scene.xy[:1, camera.slot].astype(float)
+        return next(camera.frames([0]))
 
 
 def _grown(box: Bounds, ratio: float) -> Bounds:
