@@ -25,8 +25,8 @@ from log_parser import parse
 
 import limsim_jax as lj
 from limsim_jax.api.world import World
-from limsim_jax.bridges.carla_log import FIRST_ID, carla_log
-from limsim_jax.bridges.carla_stage import stage_of
+from limsim_jax.bridges.carla.log import FIRST_ID, carla_log
+from limsim_jax.bridges.carla.stage import stage_of
 from limsim_jax.files import write_whole
 from limsim_jax.recordings.carla_bodies import BODIES
 

@@ -11,10 +11,10 @@ from carla_double import Actor, Double, Faults, Light
 from lane_worlds import lane_world
 from paths import REPO
 
-from limsim_jax.bridges.carla_camera import Camera, Mount, decoded
-from limsim_jax.bridges.carla_live import between
-from limsim_jax.bridges.carla_server import CarlaError, CarlaServer, Pose, Show, play
-from limsim_jax.bridges.carla_stage import lanes_showing, set_stage, signal_heads, stage_of
+from limsim_jax.bridges.carla.camera import Camera, Mount, decoded
+from limsim_jax.bridges.carla.live import between
+from limsim_jax.bridges.carla.server import CarlaError, CarlaServer, Pose, Show, play
+from limsim_jax.bridges.carla.stage import lanes_showing, set_stage, signal_heads, stage_of
 from limsim_jax.maps.map import load_map
 from limsim_jax.recordings.carla_bodies import BODIES
 
@@ -372,7 +372,7 @@ def test_a_stage_of_nothing(crossing, world):
 def test_an_experiment_beside_carla(carla, crossing, their_town):
     """Our traffic appears in CARLA; the ego is a hero of CARLA, and lights are CARLA's."""
     import limsim_jax as lj
-    from limsim_jax.bridges.carla_live import EnvShow, Live
+    from limsim_jax.bridges.carla.live import EnvShow, Live
 
     experiment = lj.Experiment("intersection", horizon=20.0)
     double = Double(their_town, carla)

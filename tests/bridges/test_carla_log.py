@@ -12,8 +12,8 @@ from lane_worlds import lane_world
 from log_parser import parse
 from paths import REPO, SHARED, needs_shared
 
-from limsim_jax.bridges.carla_log import carla_log, write_log
-from limsim_jax.bridges.carla_stage import stage_of, town_of
+from limsim_jax.bridges.carla.log import carla_log, write_log
+from limsim_jax.bridges.carla.stage import stage_of, town_of
 from limsim_jax.log_replay.scene import load_scene
 from limsim_jax.maps.lane_map import VEHICLE_CLASSES
 from limsim_jax.maps.map import load_map

@@ -43,7 +43,7 @@ def export(world: World, path: str | Path, to: str | None = None, *, every: floa
     if to == "carla":
         if every is not None:
             raise ValueError(f"every {every:g} s: a log of CARLA has every step; leave it out")
-        from limsim_jax.bridges.carla_log import write_log
+        from limsim_jax.bridges.carla.log import write_log
 
         return write_log(path, world)
 

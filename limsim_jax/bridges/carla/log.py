@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limsim_jax.api.world import World
-from limsim_jax.bridges.carla_stage import Stage, nearest_light, stage_of, town_of
+from limsim_jax.bridges.carla.stage import Stage, nearest_light, stage_of, town_of
 from limsim_jax.log_replay.replay import Replay
 from limsim_jax.recordings.carla_bodies import BODIES
 from limsim_jax.recordings.carla_log import (

@@ -4,10 +4,10 @@ Logs need nothing of CARLA. The server needs its client library, the extra `carl
 against a CARLA server: see the guide.
 """
 
-from limsim_jax.bridges.carla_camera import Camera, Mount
-from limsim_jax.bridges.carla_live import EnvShow, Live
-from limsim_jax.bridges.carla_log import carla_log, read_log, write_log
-from limsim_jax.bridges.carla_server import Backend, CarlaError, CarlaServer, Foreign, Pose, play
+from limsim_jax.bridges.carla.camera import Camera, Mount
+from limsim_jax.bridges.carla.live import EnvShow, Live
+from limsim_jax.bridges.carla.log import carla_log, read_log, write_log
+from limsim_jax.bridges.carla.server import Backend, CarlaError, CarlaServer, Foreign, Pose, play
 
 __all__ = [
     "Backend",

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limsim_jax.api.world import World
-from limsim_jax.bridges.carla_camera import Camera, Kind, Mount
-from limsim_jax.bridges.carla_stage import Cast, Stage, nearest_light, stage_of
+from limsim_jax.bridges.carla.camera import Camera, Kind, Mount
+from limsim_jax.bridges.carla.stage import Cast, Stage, nearest_light, stage_of
 from limsim_jax.log_replay.replay import Replay
 from limsim_jax.maps.map import Map
 from limsim_jax.maps.network import TrafficLight

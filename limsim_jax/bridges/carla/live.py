@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from limsim_jax.api.env import Env, EnvState
 from limsim_jax.api.experiment import Experiment
-from limsim_jax.bridges.carla_server import Backend, CarlaError, Foreign, Show, check_step
-from limsim_jax.bridges.carla_stage import Stage, lanes_showing, set_stage, signal_heads
+from limsim_jax.bridges.carla.server import Backend, CarlaError, Foreign, Show, check_step
+from limsim_jax.bridges.carla.stage import Stage, lanes_showing, set_stage, signal_heads
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, project, relative
 from limsim_jax.policies.base import PolicyLike
 from limsim_jax.simulation.rollout import Rollout, started
