@@ -203,8 +203,8 @@ def rollout(env: lj.Env, settings: Settings, weights: Any, worlds: Worlds, key: 
             jax.random.split(key, count), worlds.state, {"meta": meta}
         )
         # the horizon cuts an episode short: what would have come is worth its value
-        beyond: Any = ActorCritic().apply(weights, seen)[1]
-        reward = reward + settings.discount * jnp.where(late[:, None] & ~over, beyond, 0.0)
+        ahead: Any = ActorCritic().apply(weights, seen)
+        reward += settings.discount * jnp.where(late[:, None] & ~over, ahead[1], 0.0)
         done = late | over.all(-1)
         moment = Moment(
             worlds.seen, action, chance, value, reward, over | late[:, None], done[:, None] | over, driving

@@ -203,10 +203,10 @@ class _Parametric:
         """Where the curve stops and turns round, m from its start."""
         du, dv = (np.polynomial.Polynomial(cubic).deriv() for cubic in (self._u, self._v))
         speed2 = du**2 + dv**2
-        roots = np.asarray(speed2.deriv().roots())
-        p = np.unique(roots.real[np.abs(roots.imag) <= 1e-6 * np.abs(roots)])
+        roots = np.asarray(speed2.deriv().roots(), complex)
+        p: Array = np.unique(roots.real[np.abs(roots.imag) <= 1e-6 * np.abs(roots)])
         p = p[(p > 0) & (p < self._p[-1])]
-        p = p[np.sqrt(np.maximum(speed2(p), 0)) < _STOPS * self._arc[-1] / self._p[-1]]
+        p = p[self._speed(p) < _STOPS * self._arc[-1] / self._p[-1]]
         before = np.searchsorted(self._p, p, side="right") - 1
         return (self._arc[before] + self._measure(self._p[before], p)) / self.stretch
 
