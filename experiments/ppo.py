@@ -204,7 +204,8 @@ def rollout(env: lj.Env, settings: Settings, weights: Any, worlds: Worlds, key: 
         )
         # the horizon cuts an episode short: what would have come is worth its value
         ahead: Any = ActorCritic().apply(weights, seen)
-        reward += settings.discount * jnp.where(late[:, None] & ~over, ahead[1], 0.0)
+        worth: Any = jnp.where(late[:, None] & ~over, ahead[1], 0.0)
+        reward += settings.discount * worth
         done = late | over.all(-1)
         moment = Moment(
             worlds.seen, action, chance, value, reward, over | late[:, None], done[:, None] | over, driving

@@ -204,7 +204,7 @@ class _Parametric:
         du, dv = (np.polynomial.Polynomial(cubic).deriv() for cubic in (self._u, self._v))
         speed2 = du**2 + dv**2
         roots = np.asarray(speed2.deriv().roots(), complex)
-        p: Array = np.unique(roots.real[np.abs(roots.imag) <= 1e-6 * np.abs(roots)])
+        p: Array = np.unique(np.real(roots)[np.abs(np.imag(roots)) <= 1e-6 * np.abs(roots)])
         p = p[(p > 0) & (p < self._p[-1])]
         p = p[self._speed(p) < _STOPS * self._arc[-1] / self._p[-1]]
         before = np.searchsorted(self._p, p, side="right") - 1
