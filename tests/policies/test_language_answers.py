@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.policies.base import policy_name
 from limsim_jax.policies.host import FAR
 from limsim_jax.policies.language import answers, memory
 from limsim_jax.policies.language.answers import CallStatus, Reply, parse
@@ -332,6 +333,8 @@ def test_bad_input_is_one_line_before_anything_runs(monkeypatch):
 
 def test_it_has_a_name():
     assert POLICIES["language"] is language
+    if importlib.util.find_spec("httpx") is not None:
+        assert policy_name(language("http://127.0.0.1/v1", "model", check=False)) == "language"
     assert json.dumps([x.value for x in CallStatus]) == json.dumps(
         ["ok", "repaired", "illegal", "truncated", "refused", "timeout", "http", "fallback"]
     )

@@ -54,7 +54,7 @@ class ChatServer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: ChatServer
+    server: ChatServer  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def log_message(self, format: str, *args: Any) -> None:
         """Be quiet."""
@@ -183,9 +183,13 @@ def read_description(text: str) -> Facts:
     to_go, within = 0, 0.0
     if route := re.search(r"Route: (\d+) lanes? to the (left|right) within ([\d.]+)", text):
         to_go, within = int(route[1]) * (1 if route[2] == "left" else -1), float(route[3])
-    around = map(vehicle, ("Ahead", "Left ahead", "Left behind", "Right ahead", "Right behind"))
     actions = text[text.rindex("Actions:") :]
-    return Facts(v, limit, *around, light, distance, to_go, within, "LEFT =" in actions, "RIGHT =" in actions)
+    return Facts(
+        v, limit,
+        vehicle("Ahead"), vehicle("Left ahead"), vehicle("Left behind"),
+        vehicle("Right ahead"), vehicle("Right behind"),
+        light, distance, to_go, within, "LEFT =" in actions, "RIGHT =" in actions,
+    )  # fmt: skip
 
 
 def by_rules(request: dict[str, Any], number: int) -> dict[str, Any]:
