@@ -7,6 +7,8 @@ from typing import Any
 
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic, PolicyLike, build_policy
+from limsim_jax.policies.language.driver import language
+from limsim_jax.policies.language.rules import RuleTable
 from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.pdm import PDMClosed, PDMHybrid
 from limsim_jax.policies.simple import ConstantSpeed, FollowLane
@@ -64,5 +66,7 @@ POLICIES: dict[str, Callable[..., PolicyLike]] = {
     "limsim_tm": LimSimTM,
     "limsim_tm_privileged": _preset(LimSimTM, privileged=True, name="limsim_tm_privileged"),
     "area_of_interest": area_of_interest,
+    "rule_table": RuleTable,
+    "language": language,
 }
 """Factories by name; other policies are named by module and factory, `package.module:factory`."""

@@ -1,0 +1,456 @@
+"""A driver that asks a language model what to do.
+
+It is a planner on the host: once per decision it gets the scenes of all worlds, and asks about those in
+which a question is due, several at a time. Wall clock changes nothing: the time that an answer takes in the
+simulation is a setting.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from limsim_jax.policies.host import HostPolicy
+from limsim_jax.policies.language.answers import SILENT, CallStatus, Reply, parse, schema
+from limsim_jax.policies.language.chat import Chat, Outcome, Server, load_httpx, message
+from limsim_jax.policies.language.describe import PLAIN, STYLES, Style, available, description, role
+from limsim_jax.policies.language.memory import Memory, features, read_memories, similar
+from limsim_jax.policies.language.rules import between, is_due, rule_action
+from limsim_jax.policies.language.scene import Facts, LookAround, Scene, facts
+from limsim_jax.policies.language.store import Answer, Cache, Log, request_hash
+from limsim_jax.traffic.ego import Meta
+
+Images = Callable[[Any, int], Sequence[bytes]]
+"""PNG pictures of the cameras of an ego: `(scene of one world, row of the ego)`."""
+
+GRAPH = {
+    "scene": "Describe in two sentences what matters in this scene.",
+    "risk": "Which road user or signal is the greatest risk, and in how many seconds?",
+    "plan": "State your plan for the next five seconds in one sentence.",
+}
+"""Questions before that for the action, in order."""
+
+_SEED = 0  # of the sampling
+_MEMORY = 6  # asked before, time of the last question, action, its time, 1 + coming action, its time
+
+
+@dataclass(frozen=True)
+class Caps:
+    """Where a run stops to ask; then the rules drive.
+
+    Attributes:
+      calls: HTTP requests, retries and repairs included.
+      tokens: of prompts and answers. It can be passed by the questions of one decision.
+      cost: in the currency of the prices, like `tokens`.
+      prompt_price: of a million tokens.
+      answer_price: of a million tokens.
+    """
+
+    calls: int | None = None
+    tokens: int | None = None
+    cost: float | None = None
+    prompt_price: float = 0.0
+    answer_price: float = 0.0
+
+
+class _Spent:
+    """What a run has used."""
+
+    __slots__ = ("answer_tokens", "calls", "prompt_tokens")
+
+    def __init__(self) -> None:
+        self.calls = self.prompt_tokens = self.answer_tokens = 0
+
+
+class _UnknownReply(Exception):
+    """The cache has no reply."""
+
+
+class _Question(NamedTuple):
+    key: str
+    told: Facts
+    messages: list[dict[str, Any]]
+    offered: dict[Meta, str]
+
+
+class _Said(NamedTuple):
+    status: CallStatus
+    action: Meta | None
+    steps: list[tuple[str, str, CallStatus, str, str, Outcome]]  # node, hash, status, text, error, outcome
+
+
+@dataclass(frozen=True)
+class LanguageDriver:
+    """The function of a `HostPolicy`, which asks a model.
+
+    Attributes:
+      server: where the model is asked.
+      style: protocol.
+      period: s between questions; None: that of the style.
+      latency: s after which an answer counts, for one period; 0: the world waits. Without an answer that
+        counts the speed is kept.
+      graph: whether `GRAPH` is asked before the action.
+      memories: examples; the `shots` most similar ones are shown.
+      shots: most examples.
+      images: pictures of the cameras.
+      caps: of calls, tokens and cost.
+      asked_of: server and model, of which rows depend.
+      cache: of replies.
+      log: of answers.
+    """
+
+    server: Server
+    style: Style = PLAIN
+    period: float | None = None
+    latency: float = 0.0
+    graph: bool = False
+    memories: tuple[Memory, ...] = ()
+    shots: int = 3
+    images: Images | None = None
+    caps: Caps = Caps()
+    cache: Cache = field(default_factory=lambda: Cache(None), compare=False, repr=False)
+    log: Log = field(default_factory=lambda: Log(None), compare=False, repr=False)
+    asked_of: tuple[str, ...] = field(init=False, repr=False)
+    _chat: Chat = field(init=False, compare=False, repr=False)
+    _spent: _Spent = field(default_factory=_Spent, init=False, compare=False, repr=False)
+    _lock: Any = field(default_factory=threading.Lock, init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.style.images and self.images is None:
+            raise ValueError(f"style: '{self.style.name}' needs images of cameras; set images")
+        if not self.latency >= 0 or not (self.period is None or self.period > 0):
+            raise ValueError(
+                f"latency {self.latency} s, period {self.period} s; expected 0 or more, and more than 0"
+            )
+        object.__setattr__(self, "asked_of", (self.server.url, self.server.model))
+        object.__setattr__(self, "_chat", Chat(self.server, self.style.timeout))
+
+    @property
+    def chat(self) -> Chat:
+        """The client of the server."""
+        return self._chat
+
+    def __call__(self, scene: Scene, memory: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Actions `[B, E]` and the new memory, see `HostPolicy`."""
+        before, last, held, since, coming, arrival = np.moveaxis(np.array(memory), -1, 0)
+        time = np.broadcast_to(np.asarray(scene.seen.time)[:, None], last.shape)
+        period = self.style.period if self.period is None else self.period
+        held = np.where(is_due(time, since, period), int(Meta.KEEP), between(held))
+
+        def arrive() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            now = (coming > 0) & (time >= arrival - 1e-3)
+            return np.where(now, coming - 1, held), np.where(now, time, since), np.where(now, 0, coming)
+
+        held, since, coming = arrive()
+        there = np.asarray(scene.seen.length) > 0  # not in the trial of `HostPolicy`
+        due = there & (coming == 0) & ((before == 0) | is_due(time, last, period))
+        if due.any():
+            actions = self._decide(scene, due, time)
+            before, last = np.where(due, 1, before), np.where(due, time, last)
+            coming, arrival = np.where(due, 1 + actions, coming), np.where(due, time + self.latency, arrival)
+            held, since, coming = arrive()
+        kept = np.stack([before, last, held, since, coming, arrival], -1).astype(np.float32)
+        return {"meta": held.astype(np.int32)}, kept
+
+    # --- questions
+
+    def _decide(self, scene: Scene, due: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """The actions of egos whose question is due; equal questions are asked once."""
+        told = facts(scene)
+        rules = rule_action(told)
+        rows: dict[str, list[tuple[int, int]]] = {}
+        questions: dict[str, _Question] = {}
+        for world, ego in map(tuple, np.argwhere(due).tolist()):
+            question = self._question(scene, jax.tree.map(lambda x: x[world, ego].item(), told), world, ego)  # noqa: B023
+            rows.setdefault(question.key, []).append((world, ego))
+            questions.setdefault(question.key, question)
+        with self._lock:
+            said = self._answers(list(questions.values()))
+            actions = np.zeros(due.shape, int)
+            answers: list[Answer] = []
+            for key, found in said.items():
+                for k, (world, ego) in enumerate(rows[key]):
+                    silent = found.status in SILENT
+                    action = found.action
+                    if action is None:
+                        action = Meta(int(rules[world, ego])) if silent else Meta.KEEP
+                    actions[world, ego] = action
+                    moment = world, ego, round(float(time[world, ego]), 3)
+                    answers += [_answer(*moment, *step, action=action, first=k == 0) for step in found.steps]
+            self.log.add(sorted(answers, key=lambda x: (x.world, x.ego)))
+        return actions
+
+    def _question(self, scene: Scene, told: Facts, world: int, ego: int) -> _Question:
+        text, offered = description(self.style, told), available(self.style, told)
+        images = ()
+        if self.images is not None:
+            images = tuple(self.images(jax.tree.map(lambda x: x[world], scene), ego))
+        messages = [message("system", role(self.style))]
+        for example in similar(self.memories, told, self.shots):
+            messages += [message("user", example.scene), message("assistant", example.answer)]
+        messages.append(message("user", text, images))
+        return _Question(request_hash({"messages": messages, **self._settings()}), told, messages, offered)
+
+    def _settings(self) -> dict[str, Any]:
+        return {
+            "model": self.server.model,
+            "temperature": self.style.temperature,
+            "seed": _SEED,
+            "max_tokens": self.style.max_tokens,
+        }
+
+    def _answers(self, questions: list[_Question]) -> dict[str, _Said]:
+        """What the model says: from the cache, otherwise from the server within the caps."""
+
+        async def all_of_them() -> dict[str, _Said]:
+            found: dict[str, _Said] = {}
+            for question in questions:
+                try:
+                    found[question.key] = await self._discuss(question, None)
+                except _UnknownReply:
+                    found[question.key] = _Said(CallStatus.FALLBACK, None, [])
+            unknown = [x for x in questions if found[x.key].status is CallStatus.FALLBACK]
+            allowed = unknown[: self._allowed()]
+            gate = asyncio.Semaphore(self.server.concurrency)
+
+            async def one(question: _Question, client: Any) -> _Said:
+                async with gate:
+                    return await self._discuss(question, client)
+
+            if allowed:
+                async with self._chat.client() as client:
+                    replies = await asyncio.gather(*(one(x, client) for x in allowed))
+                found |= {x.key: said for x, said in zip(allowed, replies, strict=True)}
+            for question in unknown[len(allowed) :]:
+                none = Outcome(None, CallStatus.FALLBACK)
+                step = "action", question.key, CallStatus.FALLBACK, "", "a cap is reached", none
+                found[question.key] = _Said(CallStatus.FALLBACK, None, [step])
+            return found
+
+        # a thread of its own: the caller's may run an event loop already, as in a notebook
+        with ThreadPoolExecutor(1) as thread:
+            return thread.submit(lambda: asyncio.run(all_of_them())).result()
+
+    def _allowed(self) -> int:
+        """Questions that the caps allow now."""
+        caps, spent = self.caps, self._spent
+        cost = (spent.prompt_tokens * caps.prompt_price + spent.answer_tokens * caps.answer_price) / 1e6
+        over = caps.tokens is not None and spent.prompt_tokens + spent.answer_tokens >= caps.tokens
+        if over or (caps.cost is not None and cost >= caps.cost):
+            return 0
+        most = (len(GRAPH) * self.graph + 2) * (self.server.retries + 1)  # calls of one question
+        return 1_000_000 if caps.calls is None else max(caps.calls - spent.calls, 0) // most
+
+    async def _discuss(self, question: _Question, client: Any) -> _Said:
+        """The graph, the action and at most one repair. Without a client the cache must know all replies."""
+        steps: list[Any] = []
+        messages = list(question.messages)
+        if self.graph:
+            for node, asked in GRAPH.items():
+                await self._step(node, asked, messages, steps, client)
+            messages.append(message("user", f"Now decide. {role(self.style)}"))
+        form = {"schema": schema(question.offered)} if self.style.form == "json" else {}
+        key, outcome = await self._reply({"messages": messages, **self._settings(), **form}, client)
+        if outcome.reply is None:
+            steps.append(("action", key, outcome.status, "", outcome.error, outcome))
+            return _Said(outcome.status, None, steps)
+        status, action = parse(outcome.reply, question.offered)
+        last = outcome
+        if status in (CallStatus.ILLEGAL, CallStatus.TRUNCATED):
+            offered = ", ".join(question.offered.values())
+            wrong = f"That is not one of the offered actions. Offered: {offered}. Answer briefly."
+            repair = [*messages, message("assistant", outcome.reply.text or "-"), message("user", wrong)]
+            _, last = await self._reply({"messages": repair, **self._settings(), **form}, client)
+            action = parse(last.reply, question.offered)[1] if last.reply is not None else None
+            status = status if action is None else CallStatus.REPAIRED
+            last = _both(outcome, last)
+        text = last.reply.text if last.reply is not None else outcome.reply.text
+        steps.append(("action", key, status, text, last.error, last))
+        return _Said(status, action, steps)
+
+    async def _step(
+        self, node: str, asked: str, messages: list[dict[str, Any]], steps: list[Any], client: Any
+    ) -> None:
+        messages.append(message("user", asked))
+        key, outcome = await self._reply({"messages": list(messages), **self._settings()}, client)
+        if outcome.reply is None or not outcome.reply.text:  # the discussion goes on without it
+            messages.pop()
+            steps.append((node, key, outcome.status, "", outcome.error, outcome))
+            return
+        messages.append(message("assistant", outcome.reply.text))
+        steps.append((node, key, outcome.status, outcome.reply.text, "", outcome))
+
+    async def _reply(self, request: dict[str, Any], client: Any) -> tuple[str, Outcome]:
+        key = request_hash(request)
+        known = self.cache.get(key)
+        if known is not None:
+            return key, Outcome(known, CallStatus.OK)
+        if client is None:
+            raise _UnknownReply
+        outcome = await self._chat.ask(client, request)
+        self._spent.calls += outcome.calls
+        if outcome.reply is not None:
+            self._spent.prompt_tokens += outcome.reply.prompt_tokens
+            self._spent.answer_tokens += outcome.reply.answer_tokens
+            self.cache.put(key, outcome.reply)
+        return key, outcome
+
+    # --- learning from failures
+
+    def reflect(self, told: Sequence[Facts], answers: Sequence[Answer], seed: int) -> list[Memory]:
+        """Ask what was wrong in the last decisions before a failure.
+
+        Args:
+          told: facts of the scenes, as numbers.
+          answers: what was answered, one for each scene.
+          seed: of the world that failed, an even number.
+
+        Returns:
+          Corrected examples; scenes for which no offered action is found have none.
+
+        Raises:
+          ValueError: the seed is for tests.
+        """
+        Memory(seed, (), "", "")
+
+        async def all_of_them() -> list[Memory]:
+            found = []
+            async with self._chat.client() as client:
+                for facts_, answer in zip(told, answers, strict=True):
+                    text, offered = description(self.style, facts_), available(self.style, facts_)
+                    wrong = (
+                        f"This drive ended in a failure soon after. The answer was {answer.action}. "
+                        "Find the mistake, and give the action that would have been safe."
+                    )
+                    messages = [message("system", role(self.style)), message("user", f"{text}\n{wrong}")]
+                    form = {"schema": schema(offered)} if self.style.form == "json" else {}
+                    request = {"messages": messages, **self._settings(), **form}
+                    _, outcome = await self._reply(request, client)
+                    reply = outcome.reply
+                    if reply is not None and parse(reply, offered)[1] is not None:
+                        numbers = tuple(map(float, features(facts_)))
+                        found.append(Memory(seed, numbers, text, reply.text))
+            return found
+
+        with self._lock, ThreadPoolExecutor(1) as thread:
+            return thread.submit(lambda: asyncio.run(all_of_them())).result()
+
+
+def _both(first: Outcome, second: Outcome) -> Outcome:
+    """A question and its repair: calls, time and tokens of both."""
+    replies = [x.reply for x in (first, second) if x.reply is not None]
+    shown = replies[-1] if replies else Reply("")
+    tokens = {name: sum(getattr(x, name) for x in replies) for name in ("prompt_tokens", "answer_tokens")}
+    return replace(
+        second,
+        reply=replace(shown, **tokens),
+        calls=first.calls + second.calls,
+        latency=first.latency + second.latency,
+    )
+
+
+def _answer(
+    world: int, ego: int, time: float, node: str, prompt: str, status: CallStatus, text: str, error: str,
+    outcome: Outcome, *, action: Meta, first: bool,
+) -> Answer:  # fmt: skip
+    """A line of the log; calls count for the first of equal questions."""
+    asked = first and outcome.calls > 0
+    reply = outcome.reply
+    return Answer(
+        world, ego, time, node, prompt, status, action.name, text, error,
+        latency=round(outcome.latency, 4) if asked else 0.0,
+        calls=outcome.calls if asked else 0,
+        prompt_tokens=reply.prompt_tokens if asked and reply is not None else 0,
+        answer_tokens=reply.answer_tokens if asked and reply is not None else 0,
+    )  # fmt: skip
+
+
+def language(
+    server: str | None = None,
+    model: str | None = None,
+    key_variable: str = "OPENAI_API_KEY",
+    style: str = "plain",
+    period: float | None = None,
+    latency: float = 0.0,
+    graph: bool = False,
+    memory: str | None = None,
+    shots: int = 3,
+    cache: str | None = None,
+    log: str | None = None,
+    timeout: float | None = None,
+    retries: int = 2,
+    concurrency: int = 8,
+    max_calls: int | None = None,
+    max_tokens: int | None = None,
+    max_cost: float | None = None,
+    prompt_price: float = 0.0,
+    answer_price: float = 0.0,
+    images: Images | None = None,
+    check: bool = True,
+) -> HostPolicy:
+    """Egos driven by a language model behind a chat server.
+
+    Args:
+      server: URL up to `/v1`; None: `$OPENAI_BASE_URL`, otherwise that of OpenAI.
+      model: as the server names it; None: `$LIMSIM_MODEL`.
+      key_variable: environment variable with the key.
+      style: protocol, see `STYLES`.
+      period: s between questions; None: that of the style.
+      latency: s after which an answer counts; 0: the world waits.
+      graph: whether scene, risk and plan are asked for before the action.
+      memory: file of examples, see `write_memories`.
+      shots: most examples in a question.
+      cache: file of replies, which makes reruns equal.
+      log: file to which every answer is added, a line of JSON each.
+      timeout: s of a question, retries included; None: that of the style.
+      retries: more tries after errors that pass.
+      concurrency: questions at a time.
+      max_calls: HTTP requests.
+      max_tokens: of prompts and answers.
+      max_cost: in the currency of the prices.
+      prompt_price: of a million tokens.
+      answer_price: of a million tokens.
+      images: PNG pictures of the cameras of an ego.
+      check: whether the server is asked now for its models.
+
+    Raises:
+      ValueError: no server, a wrong key, an unknown model, images for a model of text, or another value that
+        makes no sense.
+    """
+    load_httpx()
+    url = server or os.environ.get("OPENAI_BASE_URL") or "https://api.openai.com/v1"
+    name = model or os.environ.get("LIMSIM_MODEL", "")
+    if not name:
+        raise ValueError("model: none; set the option model or $LIMSIM_MODEL")
+    if style not in STYLES:
+        raise ValueError(f"style: '{style}'; known are {', '.join(STYLES)}")
+    protocol = STYLES[style] if timeout is None else replace(STYLES[style], timeout=timeout)
+    try:
+        memories = read_memories(memory) if memory else ()
+    except OSError as error:
+        raise ValueError(f"memory: {memory}: {error.strerror}") from None
+    driver = LanguageDriver(
+        Server(url, name, key_variable, retries, concurrency),
+        style=protocol,
+        period=period,
+        latency=latency,
+        graph=graph,
+        memories=memories,
+        shots=shots,
+        images=images,
+        caps=Caps(max_calls, max_tokens, max_cost, prompt_price, answer_price),
+        cache=Cache(Path(cache) if cache else None),
+        log=Log(Path(log) if log else None),
+    )
+    if check:
+        driver.chat.check(images=protocol.images)
+    return HostPolicy(driver, command="meta", memory=_MEMORY, observe=LookAround(), name="language")
