@@ -210,6 +210,64 @@ def test_sumo_watches_a_world_that_we_have_driven(world: SumoWorld, tmp_path: Pa
     assert fcd.read_text().count("<timestep") >= verdict.steps
 
 
+@pytest.fixture(scope="module")
+def red(config: Path) -> Path:
+    """The same, with a program of lights that the map does not know: red for ever."""
+    add, path = config.parent / "red.add.xml", config.parent / "red.sumocfg"
+    network = load_map(config.parent / "cross.net.xml").network
+    add.write_text(
+        "<additional>"
+        + "".join(
+            f'<tlLogic id="{one.id}" type="static" programID="red" offset="0">'
+            f'<phase duration="1000" state="{"r" * len(one.phases[0].state)}"/></tlLogic>'
+            for one in network.programs.values()
+        )
+        + "</additional>"
+    )
+    inputs = "".join(
+        f'<{name} value="{value}"/>'
+        for name, value in (
+            ("net-file", "cross.net.xml"), ("route-files", "cross.rou.xml"), ("additional-files", add.name),
+        )
+    )  # fmt: skip
+    path.write_text(f"<configuration>{inputs}</configuration>")
+    return path
+
+
+@pytest.mark.engine
+def test_our_drivers_stop_at_the_red_of_sumo(world: SumoWorld, red: Path, town: Map) -> None:
+    """We drive all vehicles; SUMO inserts them and owns the signals."""
+    ours = SumoWorld(
+        red, policy=lj.ConstantSpeed(), takeover=(20, 25), horizon=30.0, slots=40, chunk=2, drivers="ours"
+    )
+    ours.episodes._compiled = world.episodes._compiled  # one program for all
+    Watched.said.clear()
+    shown = ours.run(1)
+    readings = Watched.said[0][-len(shown.trace.time) :]
+    ways = {"A1B1", "C1B1"}, {"B1C1", "B1B2", "B1A1"}
+    before, behind = ({k for k, x in enumerate(town.lane_ids) if x[:-2] in some} for some in ways)
+    trace = shown.trace
+    first, last = (trace.active[t] & (np.arange(40) > 0) for t in (0, -1))
+    assert last.sum() > first.sum() + 5, "vehicles have come"
+    assert set(trace.lane[-1, last].tolist()) <= before
+    assert not {k for t in range(len(trace.time)) for k in trace.lane[t, 1:].tolist()} & behind
+    newcomers = last & ~first
+    assert (trace.v[-1, newcomers] < 0.1).sum() >= 2, "some of them have come to stand"
+    assert (trace.v[:, 1:].max(0)[newcomers[1:]] > 5).any()
+    for t, reading in enumerate(readings):
+        there = set(reading.handle.tolist())
+        fresh = {one.handle for one in reading.new}
+        assert there - fresh <= reading.owned | fresh if t else True
+        angle = np.radians(90 - reading.angle)
+        origin = np.asarray(shown.map.lanes.origin)
+        x, y = reading.x - 2.5 * np.cos(angle) - origin[0], reading.y - 2.5 * np.sin(angle) - origin[1]
+        box = trace.box[t][trace.active[t]]
+        assert np.hypot(box[:, None, 0] - x, box[:, None, 1] - y).min(1).max() < 0.02  # m
+        assert trace.active[t].sum() == len(there)
+    with pytest.raises(lj.ExperimentError, match="drivers: 'nobody'; known are sumo, ours"):
+        SumoWorld(red, drivers="nobody")  # pyright: ignore[reportArgumentType]
+
+
 class Dying(SumoProcess):
     """Is killed while it warms up, with seed 1."""
 
