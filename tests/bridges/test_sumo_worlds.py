@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,6 +20,7 @@ from limsim_jax.bridges.sumo.ways import LETTERS, Lights, Ways
 from limsim_jax.bridges.sumo.world import SumoWorld, rebuild
 from limsim_jax.cli.main import main
 from limsim_jax.maps.map import Map, load_map
+from limsim_jax.sweeps.store import Outcome
 from limsim_jax.xla import run_once
 
 sumo = pytest.importorskip("sumo", reason="needs eclipse-sumo")
@@ -146,11 +148,22 @@ def world(config: Path) -> Any:
     patch.undo()
 
 
+@pytest.fixture(scope="module")
+def outcome(world: SumoWorld) -> Outcome:
+    return world.episodes.run([0, 3])
+
+
+@pytest.fixture(scope="module")
+def replayed(world: SumoWorld, outcome: Outcome) -> tuple[Any, list[Reading]]:
+    """A world with a contact, and what SUMO has said."""
+    Watched.said.clear()
+    seed = int(outcome.seeds[np.flatnonzero(outcome.metrics["contacts"] > 0)[0]])
+    return world.run(seed), Watched.said[0]
+
+
 @pytest.mark.engine
-def test_equal_seeds_are_equal_worlds_with_metrics_of_both_sides(world: SumoWorld) -> None:
-    seeds = [0, 3]
-    outcome = world.episodes.run(seeds)
-    again = world.episodes.run(seeds)
+def test_equal_seeds_are_equal_worlds_with_metrics_of_both_sides(world: SumoWorld, outcome: Outcome) -> None:
+    again = world.episodes.run([0, 3])
     assert outcome.digest.tolist() == again.digest.tolist()
     assert outcome.digest[0] != outcome.digest[1]
     assert set(outcome.metrics) == set(world.episodes.units)
@@ -165,12 +178,12 @@ def test_equal_seeds_are_equal_worlds_with_metrics_of_both_sides(world: SumoWorl
 
 
 @pytest.mark.engine
-def test_a_replay_shows_what_sumo_said(world: SumoWorld, town: Map, tmp_path: Path) -> None:
-    outcome = world.episodes.run([0, 3])
-    Watched.said.clear()
-    shown = world.run(3)
-    readings = Watched.said[0]
-    stored = {name: x[1] for name, x in outcome.metrics.items()}
+def test_a_replay_shows_what_sumo_said(
+    world: SumoWorld, outcome: Outcome, replayed: tuple[Any, list[Reading]], town: Map, tmp_path: Path
+) -> None:
+    shown, readings = replayed
+    row = outcome.seeds.tolist().index(shown.seed)
+    stored = {name: x[row] for name, x in outcome.metrics.items()}
     assert shown.metrics == pytest.approx(stored, nan_ok=True, rel=0, abs=0)
     steps = len(shown.trace.time)
     assert steps > 50
@@ -197,10 +210,10 @@ def test_a_replay_shows_what_sumo_said(world: SumoWorld, town: Map, tmp_path: Pa
 
 
 @pytest.mark.engine
-def test_sumo_watches_a_world_that_we_have_driven(world: SumoWorld, tmp_path: Path) -> None:
-    outcome = world.episodes.run([0, 3])
-    seed = int(outcome.seeds[np.flatnonzero(outcome.metrics["contacts"] > 0)[0]])
-    shown = world.run(seed)
+def test_sumo_watches_a_world_that_we_have_driven(
+    replayed: tuple[Any, list[Reading]], tmp_path: Path
+) -> None:
+    shown = replayed[0]
     fcd = tmp_path / "fcd.xml"
     verdict = lj.referee(shown, fcd=fcd)
     assert verdict.steps == len(shown.trace.time)
@@ -210,35 +223,23 @@ def test_sumo_watches_a_world_that_we_have_driven(world: SumoWorld, tmp_path: Pa
     assert fcd.read_text().count("<timestep") >= verdict.steps
 
 
-@pytest.fixture(scope="module")
-def red(config: Path) -> Path:
-    """The same, with a program of lights that the map does not know: red for ever."""
-    add, path = config.parent / "red.add.xml", config.parent / "red.sumocfg"
-    network = load_map(config.parent / "cross.net.xml").network
-    add.write_text(
-        "<additional>"
-        + "".join(
-            f'<tlLogic id="{one.id}" type="static" programID="red" offset="0">'
-            f'<phase duration="1000" state="{"r" * len(one.phases[0].state)}"/></tlLogic>'
-            for one in network.programs.values()
-        )
-        + "</additional>"
-    )
-    inputs = "".join(
-        f'<{name} value="{value}"/>'
-        for name, value in (
-            ("net-file", "cross.net.xml"), ("route-files", "cross.rou.xml"), ("additional-files", add.name),
-        )
-    )  # fmt: skip
-    path.write_text(f"<configuration>{inputs}</configuration>")
-    return path
+class Red(Watched):
+    """All lights are red, which no program of the map shows."""
+
+    def ask(self, orders: Orders) -> None:
+        lights = self.kept[-1].lights if self.kept else ()
+        shown = {name: "r" * len(x) for name, x in zip(self.there.lights, lights, strict=False)}
+        super().ask(replace(orders, lights=shown))
 
 
 @pytest.mark.engine
-def test_our_drivers_stop_at_the_red_of_sumo(world: SumoWorld, red: Path, town: Map) -> None:
+def test_our_drivers_stop_at_the_red_of_sumo(
+    world: SumoWorld, config: Path, town: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """We drive all vehicles; SUMO inserts them and owns the signals."""
+    monkeypatch.setattr(episodes_module, "SumoProcess", Red)
     ours = SumoWorld(
-        red, policy=lj.ConstantSpeed(), takeover=(20, 25), horizon=30.0, slots=40, chunk=2, drivers="ours"
+        config, policy=lj.ConstantSpeed(), takeover=(20, 25), horizon=25.0, slots=40, chunk=2, drivers="ours"
     )
     ours.episodes._compiled = world.episodes._compiled  # one program for all
     Watched.said.clear()
@@ -265,7 +266,7 @@ def test_our_drivers_stop_at_the_red_of_sumo(world: SumoWorld, red: Path, town: 
         assert np.hypot(box[:, None, 0] - x, box[:, None, 1] - y).min(1).max() < 0.02  # m
         assert trace.active[t].sum() == len(there)
     with pytest.raises(lj.ExperimentError, match="drivers: 'nobody'; known are sumo, ours"):
-        SumoWorld(red, drivers="nobody")  # pyright: ignore[reportArgumentType]
+        SumoWorld(config, drivers="nobody")  # pyright: ignore[reportArgumentType]
 
 
 class Dying(SumoProcess):

@@ -39,10 +39,13 @@ class SumoWorld:
         world.run(seed=3).show()
         results = world.sweep(seeds=50, out="results/town")
 
-    SUMO drives all other vehicles and owns the signals. With `drivers="ours"` our driver model drives them; SUMO
-    still inserts them, says their routes, and owns the signals. A vehicle is taken over with its route, its speed and
-    its body once SUMO has inserted it; when it arrives, it leaves SUMO as well. Equal seeds are equal traffic
-    up to what the planner changes. Each world has a SUMO process of its own.
+    SUMO drives all other vehicles and owns the signals. With `drivers="ours"` our driver model drives them,
+    with the parameters that SUMO has of them. SUMO still inserts them, says their routes, and owns the
+    signals.
+
+    A vehicle is taken over with its route, its speed and its body once SUMO has inserted it; when it arrives,
+    it leaves SUMO as well. Equal seeds are equal traffic up to what the planner changes. Each world has a
+    SUMO process of its own.
 
     Args:
       config: a `.sumocfg`.
