@@ -76,7 +76,7 @@ def figures(episodes: dict[str, list[Any]]) -> dict[str, Any]:
 
 
 def watched(world: lj.SumoWorld, kept: list[Any]) -> None:
-    """Keep maps, states and memories of the first world, for every `EVERY`th decision."""
+    """Keep every `EVERY`th decision of the first world."""
     episodes: Any = world.episodes
     start, tick, finish = episodes._compiled
     calls = 0
@@ -93,7 +93,7 @@ def watched(world: lj.SumoWorld, kept: list[Any]) -> None:
 
 
 def decision_ms(world: lj.SumoWorld, kept: list[Any]) -> float:
-    """Median time of the policy alone, of one world, on the states of the run."""
+    """Median time of a decision of the policy alone."""
     program: Any = world.episodes.program
     decide = jax.jit(partial(sighted(program.policy), program.planning), compiler_options=run_often())
     key, times = jax.random.key(0), []
@@ -122,7 +122,7 @@ def rows(
                 episodes: Any = world.episodes
                 if compiled is None:
                     compiled = episodes._compiled
-                episodes._compiled = compiled  # one program: who drives is a value
+                episodes._compiled = compiled  # one program for both kinds of drivers
                 watched(world, kept if drivers == "sumo" else [])
                 out = folder / f"{net}-{name}-{drivers}"
                 table = world.sweep(seeds, out, progress=False).episodes.to_pydict()

@@ -265,8 +265,8 @@ def test_our_drivers_stop_at_the_red_of_sumo(
         box = trace.box[t][trace.active[t]]
         assert np.hypot(box[:, None, 0] - x, box[:, None, 1] - y).min(1).max() < 0.02  # m
         assert trace.active[t].sum() == len(there)
-    with pytest.raises(lj.ExperimentError, match="drivers: 'nobody'; known are sumo, ours"):
-        SumoWorld(config, drivers="nobody")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(lj.ExperimentError, match="drivers: 'idm'; known are sumo, ours"):
+        SumoWorld(config, drivers="idm")  # pyright: ignore[reportArgumentType]
 
 
 class Dying(SumoProcess):
