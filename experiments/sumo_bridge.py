@@ -194,8 +194,8 @@ def markdown(found: dict[str, Any]) -> str:
         cells += [f"{row['at_fault_contacts']:.2f}", f"{row['completion']:.0%}", f"{row['mean_speed']:.1f}"]
         cells.append(f"{row['decision_ms']:.1f}")
         lines.append(f"| {' | '.join(map(str, cells))} |")
-    if found["rows"]:
-        lines += ["", f"Each ego has {found['horizon']:g} s.", ""]
+    ends = ["", f"Each ego has {found['horizon']:g} s.", ""]
+    lines = [*lines, *ends] if found["rows"] else []
     lines += ["| network | vehicles | SUMO's step, µs | reading, µs | moving, µs | pickling, µs |"]
     lines += ["|---|---:|---:|---:|---:|---:|"]
     for row in found["cost"]:
