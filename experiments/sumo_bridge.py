@@ -137,8 +137,9 @@ def cost(path: str) -> dict[str, Any]:
     link = Link(Start(arguments=("-c", path), seed=1, dt=0.1))
     for _ in range(WARM):
         link.step(Orders())
-    spent = dict.fromkeys(("step", "read", "move", "pipe"), 0.0)
-    counted = dict.fromkeys(spent, 0)
+    parts = "step", "read", "move", "pipe"
+    spent: dict[str, float] = {name: 0.0 for name in parts}
+    counted: dict[str, int] = {name: 0 for name in parts}
 
     def spend(name: str, begin: float, count: int) -> float:
         now = time.perf_counter()
@@ -149,7 +150,7 @@ def cost(path: str) -> dict[str, Any]:
     reading = link.read()
     for _ in range(STEPS):
         count = len(reading.handle)
-        began = spend("step", time.perf_counter(), 0)
+        began = time.perf_counter()
         link.sumo.simulationStep()
         began = spend("step", began, count)
         reading = link.read()
