@@ -1,48 +1,54 @@
-"""Our planners in SUMO's traffic, beside the same planners in ours; and what the bridge costs.
+"""Our planners among SUMO's drivers and among ours, in the same traffic; and what the bridge costs.
 
-    python experiments/sumo_bridge.py [--seeds 4] [--nets ingolstadt1] [--policies pdm_closed,limsim_tm]
+    python experiments/sumo_bridge.py [--seeds 3] [--nets ingolstadt1] [--policies pdm_closed] [--horizon 60]
     python experiments/sumo_bridge.py --full
     python experiments/sumo_bridge.py --only-cost
 
-`--full`: 50 seeds on five networks. In SUMO's traffic a car of the scenario's own demand is taken over within
-its first minutes. In ours an ego starts at random among 30 vehicles, and 300 veh/h come in at each origin.
-Both have 120 s and arrive at the end of their routes. The cost is that of a SUMO process with all its
-vehicles read, and of one that moves them all as well, per vehicle and step. Writes
-experiments/results/sumo_bridge.json and .md. Needs shared data, and the extra `sumo`.
+`--full`: 50 seeds, 120 s, both planners, five networks. A seed draws a car of the scenario's own demand;
+the planner takes it over within its first minutes. For both drivers it is the same car, at the same moment,
+among the same vehicles: SUMO drives them on, or we take all of them over. SUMO inserts vehicles, says their
+routes and owns the signals in both. Writes experiments/results/sumo_bridge.json and .md. Needs shared data,
+and the extra `sumo`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
+import pickle
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import limsim_jax as lj
+from limsim_jax.bridges.sumo.link import Link
 from limsim_jax.bridges.sumo.messages import Move, Orders, Start
-from limsim_jax.bridges.sumo.process import SumoProcess
 from limsim_jax.files import write_whole
+from limsim_jax.policies.base import sighted
 from limsim_jax.statistics import wilson
+from limsim_jax.xla import run_often
 
 RESULTS = Path(__file__).parent / "results"
 DATA = Path(os.environ.get("LIMSIM_SHARED_DATA", "shared/data")) / "sumo"
 ALL: tuple[str, ...] = (
     "ingolstadt1",
+    "limsim_roundabout",
     "bologna_pasubio",
     "limsim_town05",
-    "limsim_roundabout",
     "limsim_bigInter",
 )
-HORIZON = 120.0  # s
-VEHICLES, RATE = 30, 300.0  # of our traffic at the start, and veh/h at each origin
-COLUMNS = ("success", "contacts", "completion", "nuplan_score", "mean_speed")
+COLUMNS = ("success", "nuplan_score", "at_fault_contacts", "completion", "mean_speed", "sumo_collisions")
 WARM = 1200  # steps until there are vehicles to read
 STEPS = 200  # that are timed
+EVERY = 10  # decisions of a world, of which one is timed
+CALLS = 20  # per decision that is timed; the median counts
 
 
 def config(net: str, folder: Path) -> Path:
@@ -60,107 +66,165 @@ def config(net: str, folder: Path) -> Path:
     return path
 
 
-def figures(outcome: Any, seconds: dict[str, list[float]] | None) -> dict[str, Any]:
+def figures(episodes: dict[str, list[Any]]) -> dict[str, Any]:
     """Means over seeds, and the interval of the success."""
-    table = outcome.episodes.to_pydict()
-    found = {x: float(np.nanmean(np.array(table[x], float))) for x in COLUMNS if x in table}
-    good = np.array(table["success"], float)
+    found = {x: float(np.nanmean(np.array(episodes[x], float))) for x in COLUMNS}
+    good = np.array(episodes["success"], float)
     low, high = wilson(int(good.sum()), good.size)[1:]
-    found |= {"seeds": good.size, "success_low": low, "success_high": high}
-    if seconds is not None:
-        found["decision_ms"] = 1e3 * (
-            float(np.median(seconds["decide"])) - float(np.median(seconds["drive"]))
-        )
-        found["sumo_collisions"] = float(np.mean(table["sumo_collisions"]))
-        found["sumo_echo"] = float(np.max(table["sumo_echo"]))
+    echo = float(np.max(episodes["sumo_echo"]))
+    return found | {"seeds": good.size, "success_low": low, "success_high": high, "sumo_echo": echo}
+
+
+def watched(world: lj.SumoWorld, kept: list[Any]) -> None:
+    """Keep every `EVERY`th decision of the first world."""
+    episodes: Any = world.episodes
+    start, tick, finish = episodes._compiled
+    calls = 0
+
+    def keeping(lanes: Any, carry: Any, *more: Any) -> Any:
+        nonlocal calls
+        found = tick(lanes, carry, *more)
+        if calls % (EVERY * episodes.experiment.decision_every) == 0:
+            kept.append((lanes, *jax.tree.map(lambda x: x[0], (found[0].state, found[0].memory))))
+        calls += 1
+        return found
+
+    episodes._compiled = start, keeping, finish
+
+
+def decision_ms(world: lj.SumoWorld, kept: list[Any]) -> float:
+    """Median time of a decision of the policy alone."""
+    program: Any = world.episodes.program
+    decide = jax.jit(partial(sighted(program.policy), program.planning), compiler_options=run_often())
+    key, times = jax.random.key(0), []
+    for case in kept:
+        jax.block_until_ready(decide(*case, key))
+        for _ in range(CALLS):
+            begin = time.perf_counter()
+            jax.block_until_ready(decide(*case, key))
+            times.append(time.perf_counter() - begin)
+    return 1e3 * float(np.median(times))
+
+
+def rows(
+    nets: list[str], policies: list[str], seeds: int, horizon: float, folder: Path
+) -> list[dict[str, Any]]:
+    """A row per network, planner and drivers."""
+    found: list[dict[str, Any]] = []
+    for net in nets:
+        for name in policies:
+            compiled, kept, seen = None, [], []
+            for drivers in ("sumo", "ours"):
+                world = lj.SumoWorld(
+                    config(net, folder), policy=name, horizon=horizon, drivers=drivers, name=net,
+                    chunk=min(seeds, 4),
+                )  # fmt: skip
+                episodes: Any = world.episodes
+                if compiled is None:
+                    compiled = episodes._compiled
+                episodes._compiled = compiled  # one program for both kinds of drivers
+                watched(world, kept if drivers == "sumo" else [])
+                out = folder / f"{net}-{name}-{drivers}"
+                table = world.sweep(seeds, out, progress=False).episodes.to_pydict()
+                seen.append(figures(table) | {"net": net, "policy": name, "drivers": drivers})
+                print(seen[-1], flush=True)
+            found += [row | {"decision_ms": decision_ms(world, kept)} for row in seen]
     return found
 
 
-def rows(nets: list[str], policies: list[str], seeds: int, folder: Path) -> list[dict[str, Any]]:
-    """A row per network, planner and traffic."""
+def cost(path: str) -> dict[str, Any]:
+    """µs per vehicle and step, where all vehicles are read and moved; in a process without a simulation."""
+    link = Link(Start(arguments=("-c", path), seed=1, dt=0.1))
+    for _ in range(WARM):
+        link.step(Orders())
+    parts = "step", "read", "move", "pipe"
+    spent: dict[str, float] = {name: 0.0 for name in parts}
+    counted: dict[str, int] = {name: 0 for name in parts}
+
+    def spend(name: str, begin: float, count: int) -> float:
+        now = time.perf_counter()
+        spent[name] += now - begin
+        counted[name] += count
+        return now
+
+    reading = link.read()
+    for _ in range(STEPS):
+        count = len(reading.handle)
+        began = time.perf_counter()
+        link.sumo.simulationStep()
+        began = spend("step", began, count)
+        reading = link.read()
+        spend("read", began, len(reading.handle))
+    each = {name: spent[name] / max(counted[name], 1) for name in ("step", "read")}
+    for _ in range(STEPS):
+        columns = (reading.handle, reading.x, reading.y, reading.angle, reading.v)
+        moves = {int(h): Move(x, y, w, v) for h, x, y, w, v in zip(*columns, strict=True)}
+        orders = Orders(take=tuple(h for h in moves if h not in reading.owned), move=moves)
+        began = time.perf_counter()
+        pickle.loads(pickle.dumps(orders, pickle.HIGHEST_PROTOCOL))
+        pickle.loads(pickle.dumps(reading, pickle.HIGHEST_PROTOCOL))
+        began = spend("pipe", began, len(moves))
+        reading = link.step(orders)
+        spend("move", began, len(moves))
+    each |= {name: spent[name] / counted[name] for name in ("move", "pipe")}
+    each["move"] -= each["step"] + each["read"]
+    link.close()
+    return {"vehicles": round(counted["move"] / STEPS)} | {f"{k}_us": 1e6 * x for k, x in each.items()}
+
+
+def costs(nets: list[str], folder: Path) -> list[dict[str, Any]]:
+    """`cost` of each network, in a process of its own: libsumo holds one simulation."""
     found = []
     for net in nets:
-        path = config(net, folder)
-        for name in policies:
-            world = lj.SumoWorld(path, policy=name, horizon=HORIZON, name=net)
-            results = world.sweep(seeds, folder / f"{net}-{name}-sumo", progress=False)
-            theirs = figures(results, world.episodes.seconds)
-            ours = lj.Experiment(
-                map=world.file.map, name=net, horizon=HORIZON, ego=lj.Ego(policy=name), slots=128,
-                flows=[lj.Flow(rate=RATE)], vehicles=VEHICLES,
-            )  # fmt: skip
-            own = lj.sweep(ours, seeds=seeds, out=folder / f"{net}-{name}-ours", progress=False)
-            for traffic, row in (("SUMO", theirs), ("ours", figures(own, None))):
-                found.append({"net": net, "policy": name, "traffic": traffic, **row})
-                print(found[-1], flush=True)
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            found.append({"net": net} | pool.apply(cost, (str(config(net, folder)),)))
     return found
-
-
-def cost(net: str, folder: Path) -> dict[str, Any]:
-    """µs per vehicle and step: to read it, and to move it; and how many vehicles there are."""
-    found = {}
-    with SumoProcess(Start(arguments=("-c", str(config(net, folder))), seed=1, dt=0.1)) as process:
-        reading = process.step(Orders())
-        for _ in range(WARM):
-            reading = process.step(Orders())
-        count = len(reading.handle)
-        for name in ("read", "moved"):
-            begin = time.perf_counter()
-            for _ in range(STEPS):
-                moves = {}
-                if name == "moved":
-                    columns = (reading.handle, reading.x, reading.y, reading.angle, reading.v)
-                    moves = {int(h): Move(x, y, w, v) for h, x, y, w, v in zip(*columns, strict=True)}
-                take = tuple(h for h in moves if h not in reading.owned)
-                reading = process.step(Orders(take=take, move=moves))
-            found[name] = (time.perf_counter() - begin) / STEPS
-    each = 1e6 / count
-    return {
-        "net": net, "vehicles": count, "step_ms": 1e3 * found["read"],
-        "read_us": each * found["read"], "move_us": each * (found["moved"] - found["read"]),
-    }  # fmt: skip
 
 
 def markdown(found: dict[str, Any]) -> str:
     """Both tables."""
     lines = [
-        "| network | planner | traffic | seeds | success | contacts | nuPlan score | mean speed, m/s | "
-        "decision, ms | collisions that SUMO reports |",
+        "| network | planner | drivers | seeds | success | nuPlan score | contacts at fault | completion | "
+        "mean speed, m/s | decision, ms |",
         "|---|---|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for row in found["rows"]:
         share = f"{row['success']:.0%} [{row['success_low']:.0%}, {row['success_high']:.0%}]"
-        cells = [row["net"], row["policy"], row["traffic"], row["seeds"], share, f"{row['contacts']:.2f}"]
-        cells += [f"{row['nuplan_score']:.2f}", f"{row['mean_speed']:.1f}"]
-        known = "decision_ms" in row
-        cells += [f"{row['decision_ms']:.1f}", f"{row['sumo_collisions']:.2f}"] if known else ["", ""]
+        who = {"sumo": "SUMO's", "ours": "ours"}[row["drivers"]]
+        cells = [row["net"], row["policy"], who, row["seeds"], share, f"{row['nuplan_score']:.2f}"]
+        cells += [f"{row['at_fault_contacts']:.2f}", f"{row['completion']:.0%}", f"{row['mean_speed']:.1f}"]
+        cells.append(f"{row['decision_ms']:.1f}")
         lines.append(f"| {' | '.join(map(str, cells))} |")
-    lines += ["", "| network | vehicles | step and reading, ms | reading, µs each | moving, µs each |"]
-    lines += ["|---|---:|---:|---:|---:|"]
+    ends = ["", f"Each ego has {found['horizon']:g} s.", ""]
+    lines = [*lines, *ends] if found["rows"] else []
+    lines += ["| network | vehicles | SUMO's step, µs | reading, µs | moving, µs | pickling, µs |"]
+    lines += ["|---|---:|---:|---:|---:|---:|"]
     for row in found["cost"]:
-        lines.append(
-            f"| {row['net']} | {row['vehicles']} | {row['step_ms']:.2f} | {row['read_us']:.1f} | "
-            f"{row['move_us']:.1f} |"
-        )
-    return "\n".join(lines) + "\n"
+        parts = " | ".join(f"{row[f'{name}_us']:.1f}" for name in ("step", "read", "move", "pipe"))
+        lines.append(f"| {row['net']} | {row['vehicles']} | {parts} |")
+    return "\n".join([*lines, "", "Per vehicle and step.", ""])
 
 
 def main() -> None:
     """Run, and write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=4)
-    parser.add_argument("--nets", default="ingolstadt1")
-    parser.add_argument("--policies", default="pdm_closed,limsim_tm")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--nets", default="ingolstadt1,limsim_roundabout")
+    parser.add_argument("--policies", default="pdm_closed")
+    parser.add_argument("--horizon", type=float, default=60.0)
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--only-cost", action="store_true")
     given = parser.parse_args()
-    seeds, nets = (50, list(ALL)) if given.full else (given.seeds, given.nets.split(","))
+    nets, policies = given.nets.split(","), given.policies.split(",")
+    seeds, horizon = given.seeds, given.horizon
+    if given.full:
+        nets, policies, seeds, horizon = list(ALL), ["pdm_closed", "limsim_tm"], 50, 120.0
     path = RESULTS / "sumo_bridge.json"
-    found = json.loads(path.read_text()) if path.exists() else {"rows": []}
+    found = json.loads(path.read_text()) if path.exists() else {"rows": [], "horizon": horizon}
     with tempfile.TemporaryDirectory() as folder:
         if not given.only_cost:
-            found["rows"] = rows(nets, given.policies.split(","), seeds, Path(folder))
-        found["cost"] = [cost(net, Path(folder)) for net in ("ingolstadt1", "limsim_town05")]
+            found |= {"rows": rows(nets, policies, seeds, horizon, Path(folder)), "horizon": horizon}
+        found["cost"] = costs(["ingolstadt1", "bologna_pasubio", "limsim_town05"], Path(folder))
     write_whole(path, json.dumps(found, indent=1) + "\n")
     write_whole(path.with_suffix(".md"), markdown(found))
     print(markdown(found))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,6 +20,7 @@ from limsim_jax.bridges.sumo.ways import LETTERS, Lights, Ways
 from limsim_jax.bridges.sumo.world import SumoWorld, rebuild
 from limsim_jax.cli.main import main
 from limsim_jax.maps.map import Map, load_map
+from limsim_jax.sweeps.store import Outcome
 from limsim_jax.xla import run_once
 
 sumo = pytest.importorskip("sumo", reason="needs eclipse-sumo")
@@ -146,11 +148,22 @@ def world(config: Path) -> Any:
     patch.undo()
 
 
+@pytest.fixture(scope="module")
+def outcome(world: SumoWorld) -> Outcome:
+    return world.episodes.run([0, 3])
+
+
+@pytest.fixture(scope="module")
+def replayed(world: SumoWorld, outcome: Outcome) -> tuple[Any, list[Reading]]:
+    """A world with a contact, and what SUMO has said."""
+    Watched.said.clear()
+    seed = int(outcome.seeds[np.flatnonzero(outcome.metrics["contacts"] > 0)[0]])
+    return world.run(seed), Watched.said[0]
+
+
 @pytest.mark.engine
-def test_equal_seeds_are_equal_worlds_with_metrics_of_both_sides(world: SumoWorld) -> None:
-    seeds = [0, 3]
-    outcome = world.episodes.run(seeds)
-    again = world.episodes.run(seeds)
+def test_equal_seeds_are_equal_worlds_with_metrics_of_both_sides(world: SumoWorld, outcome: Outcome) -> None:
+    again = world.episodes.run([0, 3])
     assert outcome.digest.tolist() == again.digest.tolist()
     assert outcome.digest[0] != outcome.digest[1]
     assert set(outcome.metrics) == set(world.episodes.units)
@@ -165,12 +178,12 @@ def test_equal_seeds_are_equal_worlds_with_metrics_of_both_sides(world: SumoWorl
 
 
 @pytest.mark.engine
-def test_a_replay_shows_what_sumo_said(world: SumoWorld, town: Map, tmp_path: Path) -> None:
-    outcome = world.episodes.run([0, 3])
-    Watched.said.clear()
-    shown = world.run(3)
-    readings = Watched.said[0]
-    stored = {name: x[1] for name, x in outcome.metrics.items()}
+def test_a_replay_shows_what_sumo_said(
+    world: SumoWorld, outcome: Outcome, replayed: tuple[Any, list[Reading]], town: Map, tmp_path: Path
+) -> None:
+    shown, readings = replayed
+    row = outcome.seeds.tolist().index(shown.seed)
+    stored = {name: x[row] for name, x in outcome.metrics.items()}
     assert shown.metrics == pytest.approx(stored, nan_ok=True, rel=0, abs=0)
     steps = len(shown.trace.time)
     assert steps > 50
@@ -197,10 +210,10 @@ def test_a_replay_shows_what_sumo_said(world: SumoWorld, town: Map, tmp_path: Pa
 
 
 @pytest.mark.engine
-def test_sumo_watches_a_world_that_we_have_driven(world: SumoWorld, tmp_path: Path) -> None:
-    outcome = world.episodes.run([0, 3])
-    seed = int(outcome.seeds[np.flatnonzero(outcome.metrics["contacts"] > 0)[0]])
-    shown = world.run(seed)
+def test_sumo_watches_a_world_that_we_have_driven(
+    replayed: tuple[Any, list[Reading]], tmp_path: Path
+) -> None:
+    shown = replayed[0]
     fcd = tmp_path / "fcd.xml"
     verdict = lj.referee(shown, fcd=fcd)
     assert verdict.steps == len(shown.trace.time)
@@ -208,6 +221,52 @@ def test_sumo_watches_a_world_that_we_have_driven(world: SumoWorld, tmp_path: Pa
     ours = [c.time for c in verdict.collisions if shown.ego in c.slots]
     assert min(ours) == pytest.approx(shown.metrics["contact_time"], abs=0.11)
     assert fcd.read_text().count("<timestep") >= verdict.steps
+
+
+class Red(Watched):
+    """All lights are red, which no program of the map shows."""
+
+    def ask(self, orders: Orders) -> None:
+        lights = self.kept[-1].lights if self.kept else ()
+        shown = {name: "r" * len(x) for name, x in zip(self.there.lights, lights, strict=False)}
+        super().ask(replace(orders, lights=shown))
+
+
+@pytest.mark.engine
+def test_our_drivers_stop_at_the_red_of_sumo(
+    world: SumoWorld, config: Path, town: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """We drive all vehicles; SUMO inserts them and owns the signals."""
+    monkeypatch.setattr(episodes_module, "SumoProcess", Red)
+    ours = SumoWorld(
+        config, policy=lj.ConstantSpeed(), takeover=(20, 25), horizon=25.0, slots=40, chunk=2, drivers="ours"
+    )
+    ours.episodes._compiled = world.episodes._compiled  # one program for all
+    Watched.said.clear()
+    shown = ours.run(1)
+    readings = Watched.said[0][-len(shown.trace.time) :]
+    ways = {"A1B1", "C1B1"}, {"B1C1", "B1B2", "B1A1"}
+    before, behind = ({k for k, x in enumerate(town.lane_ids) if x[:-2] in some} for some in ways)
+    trace = shown.trace
+    first, last = (trace.active[t] & (np.arange(40) > 0) for t in (0, -1))
+    assert last.sum() > first.sum() + 5, "vehicles have come"
+    assert set(trace.lane[-1, last].tolist()) <= before
+    assert not {k for t in range(len(trace.time)) for k in trace.lane[t, 1:].tolist()} & behind
+    newcomers = last & ~first
+    assert (trace.v[-1, newcomers] < 0.1).sum() >= 2, "some of them have come to stand"
+    assert (trace.v[:, 1:].max(0)[newcomers[1:]] > 5).any()
+    for t, reading in enumerate(readings):
+        there = set(reading.handle.tolist())
+        fresh = {one.handle for one in reading.new}
+        assert there - fresh <= reading.owned | fresh if t else True
+        angle = np.radians(90 - reading.angle)
+        origin = np.asarray(shown.map.lanes.origin)
+        x, y = reading.x - 2.5 * np.cos(angle) - origin[0], reading.y - 2.5 * np.sin(angle) - origin[1]
+        box = trace.box[t][trace.active[t]]
+        assert np.hypot(box[:, None, 0] - x, box[:, None, 1] - y).min(1).max() < 0.02  # m
+        assert trace.active[t].sum() == len(there)
+    with pytest.raises(lj.ExperimentError, match="drivers: 'idm'; known are sumo, ours"):
+        SumoWorld(config, drivers="idm")  # pyright: ignore[reportArgumentType]
 
 
 class Dying(SumoProcess):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.bridges.sumo.messages import Move, Orders, Reading, Start, SumoError
 from limsim_jax.bridges.sumo.process import SumoProcess
-from limsim_jax.bridges.sumo.program import Pushed, Seen, SharedWorld
+from limsim_jax.bridges.sumo.program import NOWHERE, Pushed, Seen, SharedWorld
 from limsim_jax.bridges.sumo.seats import Places, Seats, angle_of, class_of
 from limsim_jax.bridges.sumo.ways import Lights, Ways
 from limsim_jax.maps.lane_map import LaneMap
@@ -70,12 +70,14 @@ class Takeover:
         after a moment that the seed draws.
       count: how many, where they are drawn.
       earliest, latest: s after the begin of the simulation; bounds of that moment.
+      everyone: we take over the other vehicles as well, from that moment or their insertion on.
     """
 
     vehicles: tuple[str, ...] = ()
     count: int = 1
     earliest: float = 60.0
     latest: float = 180.0
+    everyone: bool = False
 
     def __post_init__(self) -> None:
         if self.count < 1:
@@ -202,7 +204,8 @@ class SumoEpisodes:
             "engine": {
                 "name": "sumo", "version": version, "config": str(self.config.resolve()),
                 "vehicles": list(takeover.vehicles), "count": takeover.count,
-                "earliest": takeover.earliest, "latest": takeover.latest, "bridge": _bridge_hash(),
+                "earliest": takeover.earliest, "latest": takeover.latest,
+                "everyone": takeover.everyone, "bridge": _bridge_hash(),
             }
         }  # fmt: skip
 
@@ -268,7 +271,10 @@ class SumoEpisodes:
 
     def _world(self, sumo: SumoProcess, seed: int) -> _World:
         assert self._places is not None and self._lights is not None
-        return _World(sumo, seed, Seats(self._places, self._ways, self._lights, self.experiment.slots), self)
+        seats = Seats(
+            self._places, self._ways, self._lights, self.experiment.slots, everyone=self.takeover.everyone
+        )
+        return _World(sumo, seed, seats, self)
 
     def _drive(self, worlds: list[_World], keep: bool) -> _Ran:
         """All worlds through time, together."""
@@ -364,6 +370,7 @@ class _World:
         self._met: list[dict[int, float]] = [{} for _ in range(egos)]  # by handle, s
         self._echo = np.zeros(egos)
         self._gone = np.zeros(egos, bool)
+        self._ours: set[int] = set()  # vehicles that SUMO knows to be ours
 
     def begin(self) -> Seen:
         """Run SUMO until the egos are there, and take them over."""
@@ -391,13 +398,22 @@ class _World:
                 )
                 raise SumoError(f"{self._of.config}: {what} (seed {self.seed})")
         egos = tuple(candidates[: takeover.egos])
-        self._orders = {"take": egos}
         self._last = self.seats.start(self.reading, egos)
         for handle in egos:
             if self.seats.column[handle] == 0:
                 one = self.seats.known[handle]
                 raise SumoError(f"{self._of.config}: the route of '{one.id}' cannot be driven on the map")
+        self._own()
         return self._last
+
+    def _own(self) -> None:
+        """Take over and hand back: with the next orders."""
+        there = set(self.reading.handle.tolist())
+        ours = set(self.seats.egos)
+        if self._of.takeover.everyone:
+            ours |= {h for h in self.seats.slot if self.seats.column[h] != NOWHERE}
+        take, release = sorted((ours - self._ours) & there), sorted((self._ours - ours) & there)
+        self._orders, self._ours = {"take": tuple(take), "release": tuple(release)}, ours & there
 
     def _fits(self, handle: int) -> bool:
         """Whether a vehicle can be an ego: a car with some way to go."""
@@ -416,12 +432,15 @@ class _World:
         """Tell SUMO where our vehicles will be; it begins its step."""
         x0, y0 = self.seats.places.origin
         moves, remove = {}, []
-        for k, handle in enumerate(self.seats.egos):
-            if self._gone[k]:
+        for handle in sorted(self._ours, key=self.seats.slot.__getitem__):
+            k = self.seats.slot[handle]
+            ego = k < len(self._gone)
+            if ego and self._gone[k]:
                 continue
             if not pushed.active[k]:
                 remove.append(handle)
-                self._gone[k] = True
+                if ego:
+                    self._gone[k] = True
                 continue
             ghost = pushed.ghost[k].astype(float)
             moves[handle] = Move(
@@ -437,7 +456,6 @@ class _World:
             )
         self._pushed = pushed
         self.sumo.ask(Orders(move=moves, remove=tuple(remove), **self._orders))
-        self._orders = {}
 
     def see(self) -> Seen:
         """What SUMO says after its step."""
@@ -451,6 +469,7 @@ class _World:
             self._over = self.reading.time + AFTERWARDS
         over = self._over is not None and self.reading.time >= self._over
         seen = self.seats.see(self.reading)
+        self._own()
         # a world that is over settles this moment, and no other
         self._last = replace(seen, alive=np.bool_(False))
         self.alive = not over

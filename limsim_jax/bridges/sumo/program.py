@@ -6,6 +6,9 @@ contacts and metrics, but where they are is what SUMO says. A tick has two halve
 1. `settle`: the moment that both sides have reached. Foreign vehicles are written into their slots, contacts
    are looked for, metrics are kept.
 2. `move`: decide if it is time, and drive our vehicles to the next moment. SUMO drives the others there.
+
+With `Seen.everyone`, the vehicles in slots are ours: SUMO inserts them, and they are foreign at that moment
+only. Those whose route leads nowhere on the map stay SUMO's.
 """
 
 from __future__ import annotations
@@ -35,6 +38,9 @@ from limsim_jax.traffic.motion import boxes, without
 from limsim_jax.traffic.parameters import DRIVING
 from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config, Driver, Egos, Queues, Shape, State, Status
+
+NOWHERE = 0
+"""Column of routes that cannot be driven on the map."""
 
 _OVER_LINE = 0.1  # m of a foreign body beyond the line from which it is in two lanes
 _OURS = Status.NOT_FINITE | Status.RED_LIGHT | Status.HARD_BRAKE | Status.MISSED_ROUTE
@@ -66,6 +72,7 @@ class Seen:
     lost: Int[Array, ""]  # vehicles without a slot
     ended: Bool[Array, " E"]  # SUMO has taken the ego off the road
     alive: Bool[Array, ""]  # the world goes on; otherwise nothing changes
+    everyone: Bool[Array, ""]  # we drive the others as well
 
 
 class Moved(NamedTuple):
@@ -90,16 +97,16 @@ class SharedCarry(NamedTuple):
 
 
 class Pushed(NamedTuple):
-    """Where our vehicles are at the next moment, `[E]`: for SUMO."""
+    """Where our vehicles are at the next moment: for SUMO. Rows of its own vehicles mean nothing."""
 
-    x: Float[Array, " E"]  # m, middle of the front bumper
-    y: Float[Array, " E"]
-    heading: Float[Array, " E"]  # rad
-    v: Float[Array, " E"]  # m/s
-    a: Float[Array, " E"]  # m/s^2
-    active: Bool[Array, " E"]
-    goal: Int[Array, " E"]
-    ghost: Float[Array, "E 3"]  # x, y, heading of the body on a second lane; NaN: it is on one
+    x: Float[Array, " N"]  # m, middle of the front bumper
+    y: Float[Array, " N"]
+    heading: Float[Array, " N"]  # rad
+    v: Float[Array, " N"]  # m/s
+    a: Float[Array, " N"]  # m/s^2
+    active: Bool[Array, " N"]
+    goal: Int[Array, " N"]
+    ghost: Float[Array, "N 3"]  # x, y, heading of the body on a second lane; NaN: it is on one
 
 
 @dataclass(frozen=True)
@@ -213,9 +220,11 @@ class SharedWorld:
         """The world with SUMO's vehicles where they are; those that have left; how far all came (m)."""
         before, moved = carry.state, carry.moved
         after, dt = moved.state, self.dt
-        foreign = jnp.arange(seen.lane.shape[0]) >= self.egos
+        others = jnp.arange(seen.lane.shape[0]) >= self.egos
+        foreign = others & (seen.fresh | (seen.goal == NOWHERE) | ~seen.everyone)
         ended = at_slots(after.egos, seen.ended, jnp.zeros_like(foreign)) & before.active
-        there = jnp.where(foreign, seen.present & (seen.lane != NO_LANE), after.active & ~ended)
+        kept = after.active & ~ended & (seen.present | ~others)
+        there = jnp.where(foreign, seen.present & (seen.lane != NO_LANE), kept)
         same = before.active & ~seen.fresh
         s, d = _on_lane(lanes, seen)
         previous, earlier = _trail(lanes, before, seen.lane, same)
@@ -241,7 +250,7 @@ class SharedWorld:
             next=before.queues.next + jnp.sum(fresh & there, dtype=jnp.int32),
             full=before.queues.full + seen.lost,
         )
-        left = jnp.where(foreign, seen.arrived & before.active, moved.left | ended)
+        left = jnp.where(foreign, False, moved.left | ended) | (others & seen.arrived & before.active)
         state = replace(
             after,
             active=there,
@@ -297,21 +306,21 @@ class SharedWorld:
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     def _pushed(self, lanes: LaneMap, state: State) -> Pushed:
-        slot = state.egos.slot
-        egos = state.egos
-        half = state.shape.length[slot] / 2
-        lane, s, side = state.lane[slot], state.s[slot], state.side[slot]
+        egos, slot = state.egos, state.egos.slot
+        own = zip(boxes(lanes, state)[:, :3].T, (egos.x, egos.y, egos.heading), strict=True)
+        x, y, heading = (column.at[slot].set(mine) for column, mine in own)
+        half = state.shape.length / 2
+        lane, s, side = state.lane, state.s, state.side
         beside = jnp.where(side > 0, lanes.left[lane], jnp.where(side < 0, lanes.right[lane], NO_LANE))
-        x, y, along = pose(lanes, beside, side_s(lanes, lane, s, side))
-        ghost = jnp.stack([x, y, along], -1)
+        ghost = jnp.stack(pose(lanes, beside, side_s(lanes, lane, s, side)), -1)
         return Pushed(
-            x=egos.x + half * jnp.cos(egos.heading),
-            y=egos.y + half * jnp.sin(egos.heading),
-            heading=wrap_angle(egos.heading),
-            v=state.v[slot],
-            a=state.a[slot],
-            active=state.active[slot],
-            goal=state.goal[slot],
+            x=x + half * jnp.cos(heading),
+            y=y + half * jnp.sin(heading),
+            heading=wrap_angle(heading),
+            v=state.v,
+            a=state.a,
+            active=state.active,
+            goal=state.goal,
             ghost=jnp.where((beside == NO_LANE)[:, None], jnp.nan, ghost),
         )
 

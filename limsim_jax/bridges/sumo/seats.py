@@ -65,10 +65,13 @@ class Seats:
       ways: columns for routes; shared by all worlds of a call.
       lights: phases of lights; shared as well.
       slots: N.
-      egos: handles of our vehicles, in the first slots.
+      everyone: we drive all vehicles with a seat.
     """
 
-    def __init__(self, places: Places, ways: Ways, lights: Lights, slots: int) -> None:
+    def __init__(
+        self, places: Places, ways: Ways, lights: Lights, slots: int, *, everyone: bool = False
+    ) -> None:
+        self.everyone = everyone
         self.places, self.ways, self.lights, self.slots = places, ways, lights, slots
         self.known: dict[int, Newcomer] = {}
         self.egos: tuple[int, ...] = ()
@@ -107,7 +110,8 @@ class Seats:
         """A moment as arrays: seats are given and given back."""
         arrived, fresh = (np.zeros(self.slots, bool) for _ in range(2))
         row = self.places.row[reading.lane]
-        on = {h: k for k, h in enumerate(reading.handle.tolist()) if row[k] >= 0}
+        kept = reading.owned & self.slot.keys()  # ours keep their seat wherever SUMO sees them
+        on = {h: k for k, h in enumerate(reading.handle.tolist()) if row[k] >= 0 or h in kept}
         self.elsewhere = max(self.elsewhere, int(np.sum((row < 0) & (reading.lane >= 0))))
         others = [h for h in on if h not in self.egos]
         room = self.slots - len(self.egos)
@@ -170,6 +174,7 @@ class Seats:
             "lost": np.int32(lost),
             "ended": np.array([h not in there for h in self.egos], bool),
             "alive": np.bool_(alive),
+            "everyone": np.bool_(self.everyone),
         }
         return Seen(**found)
 

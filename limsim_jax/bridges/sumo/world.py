@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 from pydantic import ValidationError
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from limsim_jax.bridges.sumo.episodes import SumoEpisodes
     from limsim_jax.metrics.measure import Metric
     from limsim_jax.policies.base import PolicyLike
+
+Drivers = Literal["sumo", "ours"]
 
 HORIZON = 180.0
 """s that an ego has for its trip, unless the caller says another number."""
@@ -37,9 +39,13 @@ class SumoWorld:
         world.run(seed=3).show()
         results = world.sweep(seeds=50, out="results/town")
 
-    SUMO drives all other vehicles and owns the signals. A vehicle is taken over with its route, its speed and
-    its body once SUMO has inserted it; when it arrives, it leaves SUMO as well. Equal seeds are equal traffic
-    up to what the planner changes. Each world has a SUMO process of its own.
+    SUMO drives all other vehicles and owns the signals. With `drivers="ours"` our driver model drives them,
+    with the parameters that SUMO has of them. SUMO still inserts them, says their routes, and owns the
+    signals.
+
+    A vehicle is taken over with its route, its speed and its body once SUMO has inserted it; when it arrives,
+    it leaves SUMO as well. Equal seeds are equal traffic up to what the planner changes. Each world has a
+    SUMO process of its own.
 
     Args:
       config: a `.sumocfg`.
@@ -49,6 +55,7 @@ class SumoWorld:
       takeover: s after the begin between which they are drawn: the first ones that are inserted from then on.
       horizon: s from the takeover on.
       dt: s, step of both sides; None: that of the `.sumocfg`, at most 0.1 s.
+      drivers: of the other vehicles: "sumo", or "ours".
       decision_every: steps per decision of the policy; None: those of 0.5 s.
       slots: vehicles around the egos that a world holds; the nearest where there are more.
       view: what the policy sees, fields of `View`.
@@ -72,6 +79,7 @@ class SumoWorld:
         egos: int = 1,
         takeover: tuple[float, float] = (60.0, 180.0),
         horizon: float = HORIZON,
+        drivers: Drivers = "sumo",
         dt: float | None = None,
         decision_every: int | None = None,
         slots: int = SLOTS,
@@ -85,6 +93,9 @@ class SumoWorld:
         self.config = Path(config)
         self.vehicles = (ego,) if isinstance(ego, str) else tuple(ego or ())
         self.takeover = (egos, *map(float, takeover))
+        if drivers not in get_args(Drivers):
+            raise ExperimentError(f"drivers: '{drivers}'; known are {', '.join(get_args(Drivers))}")
+        self.drivers = drivers
         self.policy = None if isinstance(policy, str) else policy
         self.metrics, self.chunk, self.gui = tuple(metrics), chunk, gui
         table = experiment_of(
@@ -110,7 +121,10 @@ class SumoWorld:
 
         count, earliest, latest = self.takeover
         try:
-            takeover = Takeover(vehicles=self.vehicles, count=int(count), earliest=earliest, latest=latest)
+            takeover = Takeover(
+                vehicles=self.vehicles, count=int(count), earliest=earliest, latest=latest,
+                everyone=self.drivers == "ours",
+            )  # fmt: skip
         except ValueError as error:
             raise ExperimentError(f"{self.file.name}: {error}") from None
         return SumoEpisodes(
@@ -213,7 +227,7 @@ def rebuild(about: Mapping[str, Any]) -> SumoEpisodes:
     from limsim_jax.bridges.sumo.episodes import SumoEpisodes, Takeover
 
     engine = about["engine"]
-    names = "count", "earliest", "latest"
+    names = "count", "earliest", "latest", "everyone"
     takeover = Takeover(vehicles=tuple(engine["vehicles"]), **{name: engine[name] for name in names})
     experiment = ExperimentFile.model_validate(about["experiment"] | {"map": about["map_file"]})
     return SumoEpisodes(experiment, Path(engine["config"]), takeover, chunk=about["chunk"])
