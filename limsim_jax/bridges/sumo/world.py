@@ -227,8 +227,9 @@ def rebuild(about: Mapping[str, Any]) -> SumoEpisodes:
     from limsim_jax.bridges.sumo.episodes import SumoEpisodes, Takeover
 
     engine = about["engine"]
-    names = "count", "earliest", "latest", "everyone"
-    takeover = Takeover(vehicles=tuple(engine["vehicles"]), **{name: engine[name] for name in names})
+    names = "count", "earliest", "latest"
+    known = {name: engine[name] for name in names} | {"everyone": engine.get("everyone", False)}
+    takeover = Takeover(vehicles=tuple(engine["vehicles"]), **known)
     experiment = ExperimentFile.model_validate(about["experiment"] | {"map": about["map_file"]})
     return SumoEpisodes(experiment, Path(engine["config"]), takeover, chunk=about["chunk"])
 
