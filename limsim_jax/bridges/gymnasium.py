@@ -209,6 +209,8 @@ class Env(gymnasium.Env[NDArray[np.float32], Any]):
       ValueError: an unknown option, a seed out of range, or an action of another shape or not finite.
     """
 
+    metadata = {"render_modes": list(RENDER_MODES)}  # noqa: RUF012 - as Gymnasium has it, and asks for it
+
     def __init__(
         self,
         experiment: Source | None = None,

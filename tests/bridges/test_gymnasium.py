@@ -172,7 +172,7 @@ def test_wrong_actions_and_seeds_are_one_line(core):
 def test_names_are_registered():
     with pytest.raises(gymnasium.error.NameNotFound):
         gymnasium.make("limsim_jax/Motorway-v0")
-    env = gymnasium.make("limsim_jax/Roundabout-v0", action="trajectory")
+    env = gymnasium.make("limsim_jax/Roundabout-v0", action="trajectory", render_mode="rgb_array")
     assert env.action_space.shape == (4, SAMPLES) and env.observation_space.shape == (
         lj.ObserveVector().size,
     )

