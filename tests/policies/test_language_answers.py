@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+from typing import Any
 
 import chat_server as stub
 import numpy as np
@@ -37,12 +38,13 @@ def some_facts(rng) -> Facts:
         return Neighbour(float(gap), float(rng.uniform(0, 35)) if gap < NONE else 0.0)
 
     shown = rng.random() < 0.5
-    return Facts(
+    facts: list[Any] = [
         float(rng.uniform(0, 35)), float(rng.uniform(8, 36)), *(other() for _ in range(5)),
         int(rng.integers(0, 7)) if shown else int(SignalState.OFF),
         float(rng.uniform(0, 150)) if shown else FAR,
         int(rng.integers(-2, 3)), float(rng.uniform(0, 2000)), *(bool(rng.random() < 0.5) for _ in "lr"),
-    )  # fmt: skip
+    ]  # fmt: skip
+    return Facts(*facts)
 
 
 def test_a_description_tells_all_facts_in_few_tokens():
@@ -304,6 +306,7 @@ def test_pictures_are_sent_as_png():
 @needs_httpx
 def test_bad_input_is_one_line_before_anything_runs(monkeypatch):
     monkeypatch.setenv("OPENAI_API_KEY", "sk-wrong")
+    make: Any = language
     no_images = stub.error(500, "image input is not supported")
     with stub.serving(stub.always(no_images)) as server:
         options = {"server": server.url, "model": "model"}
@@ -319,13 +322,13 @@ def test_bad_input_is_one_line_before_anything_runs(monkeypatch):
         ]
         for change, text in cases:
             with pytest.raises(ValueError, match=text) as caught:
-                language(**options | change)
+                make(**options | change)
             assert "\n" not in str(caught.value) and "sk-wrong" not in str(caught.value)
         server.key = stub.KEY
         with pytest.raises(ValueError, match=r"refuses the key in \$OPENAI_API_KEY"):
-            language(**options)
+            make(**options)
     with pytest.raises(ValueError, match=r"server: no answer from http://127\.0\.0\.1"):
-        language(**options)
+        make(**options)
     monkeypatch.delenv("LIMSIM_MODEL", raising=False)
     with pytest.raises(ValueError, match=r"model: none; set the option model or \$LIMSIM_MODEL"):
         language(server=server.url)

@@ -23,7 +23,7 @@ SEEDS = range(2)
 def episodes(policy):
     ego = EgoTable(start="1-", lane=2, s=60.0, v=12.0, goal="2-")
     experiment = ExperimentFile(
-        name="small", map="highway", horizon=20.0, slots=32, ego=[ego], traffic=TrafficTable(vehicles=20)
+        name="small", map="highway", horizon=20.0, slots=32, ego=(ego,), traffic=TrafficTable(vehicles=20)
     )
     return Episodes(experiment, chunk=len(SEEDS), policy=policy)
 
