@@ -43,7 +43,7 @@ Pair = tuple[str, str]
 
 
 def bridge_lanes(
-    lanes: dict[str, Lane], across: Mapping[Pair, str], report: ImportReport
+    lanes: dict[str, Lane], across: Mapping[Pair, str], report: ImportReport, *, back: bool = True
 ) -> tuple[dict[Pair, Lane], set[Pair]]:
     """Put a lane across every gap between linked lanes.
 
@@ -53,6 +53,8 @@ def bridge_lanes(
       lanes: of a map, by id; changed in place.
       across: junctions that links between lanes outside cross.
       report: receives a note for every gap.
+      back: whether to look at lanes that lead back beside the end of another, too. SUMO's networks without
+        lanes in junctions turn round like that.
 
     Returns:
       The new lanes by the pair that they join, and the pairs whose link is gone.
@@ -64,7 +66,7 @@ def bridge_lanes(
         for after in (lanes[name] for name in before.successors):
             gap = _gap(before, after)
             leaps = gap > LEAP * max(min(before.width[-1], after.width[0]), 1.0)
-            leaps |= gap > _ASIDE and _turn(before, after) > _BACK
+            leaps |= back and gap > _ASIDE and _turn(before, after) > _BACK
             if not after.drivable or not leaps:
                 continue
             if goes_on_beside(lanes, before, after) is not None:
@@ -149,7 +151,7 @@ def bridge(network: Network) -> Network:
     """
     lanes = dict(network.lanes)
     across = {(m.incoming, m.outgoing): m.junction for m in network.movements if not m.via}
-    made, cut = bridge_lanes(lanes, across, network.report)
+    made, cut = bridge_lanes(lanes, across, network.report, back=False)
     if not made and not cut:
         return network
     roads = network.roads | bridge_roads(network.roads, lanes, made)
