@@ -16,6 +16,7 @@ from limsim_jax.api.experiment import Experiment
 from limsim_jax.geometry import boxes_overlap
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.map import Map
+from limsim_jax.metrics.scores import NUPLAN_OVERSPEED, NUPLAN_TTC
 from limsim_jax.policies.host import Kind, Observation, Observe, command_from
 from limsim_jax.policies.predict import constant_velocity, nearest
 from limsim_jax.policies.view import view_of
@@ -72,8 +73,8 @@ Reward = Callable[[Info, Info], Float[Array, " E"] | tuple[Float[Array, " E"], d
 With a dictionary of its terms beside it, they stand in `Info.terms`.
 """
 
-CLOSING = 0.95
-"""s, least time to collision (nuPlan, `time_to_collision_within_bound`)."""
+CLOSING = NUPLAN_TTC[0]
+"""s, least time to collision."""
 
 _MOMENTS = 4  # at which bodies are compared within that time
 _OTHERS = 8  # nearest vehicles that are compared
@@ -121,14 +122,14 @@ class RouteReward:
     Attributes:
       scale: reward of a whole route.
       penalty: of an infraction.
-      over: m/s above the limit at which nothing is left (nuPlan, `max_overspeed_value_threshold`).
+      over: m/s above the limit at which nothing is left (that of nuPlan's score).
       soft: factor of a step that is uncomfortable, by nuPlan's bounds of the acceleration, or in which the
         ego closes in on another vehicle, `Info.closing`.
     """
 
     scale: float = 10.0
     penalty: float = 5.0
-    over: float = 2.23
+    over: float = NUPLAN_OVERSPEED
     soft: float = 0.5
 
     def __call__(self, before: Info, now: Info) -> tuple[Float[Array, " E"], dict[str, Array]]:

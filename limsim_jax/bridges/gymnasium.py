@@ -34,7 +34,7 @@ from limsim_jax.bridges.learning import (
     seen_shape,
 )
 from limsim_jax.policies.host import Kind
-from limsim_jax.simulation.trace import Trace
+from limsim_jax.simulation.trace import Trace, moment
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import State
 from limsim_jax.xla import enable_compilation_cache
@@ -424,25 +424,12 @@ class _Pictures:
 def _moment(core: PureEnv) -> Callable[[Any, int], Trace]:
     """World `k` of a batch now, as a trace of one step."""
 
-    def moment(states: EnvState, k: Any) -> Trace:
+    def now(states: EnvState, k: Any) -> Trace:
         state: State = jax.tree.map(lambda x: x[k], states.world)
-        now = Trace(
-            time=core.config.time(state.step),
-            active=state.active,
-            vehicle=state.vehicle,
-            lane=state.lane,
-            s=state.s,
-            d=state.d,
-            v=state.v,
-            a=state.a,
-            box=boxes(core.lanes, state),
-            status=state.status,
-            phase=state.lights.phase,
-            driven=state.egos.slot,
-        )
-        return jax.tree.map(lambda x: x[None], now)
+        seen = moment(state, core.config.time(state.step), boxes(core.lanes, state))
+        return jax.tree.map(lambda x: x[None], seen)
 
-    return jax.jit(moment)
+    return jax.jit(now)
 
 
 register()

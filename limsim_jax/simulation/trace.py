@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.traffic.engine import Tick
+from limsim_jax.types import State
 
 
 class Trace(NamedTuple):
@@ -43,28 +44,38 @@ def trace(lane_map: LaneMap) -> Callable[[Tick], Trace]:
     def record(tick: Tick) -> Trace:
         state = tick.state
         some = state.egos.slot.shape[0] > 0
-        driven = jnp.where(state.active[state.egos.slot], state.egos.slot, -1) if some else None
-        plan, plan_time = _plan(tick, driven)
-        return Trace(
-            time=tick.time,
-            active=state.active,
-            vehicle=state.vehicle,
-            lane=state.lane,
-            s=state.s,
-            d=state.d,
-            v=state.v,
-            a=state.a,
-            box=tick.box,
-            status=state.status,
-            phase=state.lights.phase,
-            vehicle_class=state.shape.vehicle_class,
-            driven=driven,
-            to_go=_to_go(lane_map, tick) if some else None,
-            plan=plan,
-            plan_time=plan_time,
-        )
+        seen = moment(state, tick.time, tick.box)
+        plan, plan_time = _plan(tick, seen.driven)
+        to_go = _to_go(lane_map, tick) if some else None
+        return seen._replace(to_go=to_go, plan=plan, plan_time=plan_time)
 
     return record
+
+
+def moment(state: State, time: Float[Array, ""], box: Float[Array, "N 5"]) -> Trace:
+    """A world at one moment, without plans.
+
+    Args:
+      state: the world.
+      time: s.
+      box: `motion.boxes` of the state.
+    """
+    slot = state.egos.slot
+    return Trace(
+        time=time,
+        active=state.active,
+        vehicle=state.vehicle,
+        lane=state.lane,
+        s=state.s,
+        d=state.d,
+        v=state.v,
+        a=state.a,
+        box=box,
+        status=state.status,
+        phase=state.lights.phase,
+        vehicle_class=state.shape.vehicle_class,
+        driven=jnp.where(state.active[slot], slot, -1) if slot.shape[0] else None,
+    )
 
 
 def _plan(tick: Tick, driven: Int[Array, " E"] | None) -> tuple[Array | None, Array | None]:

@@ -23,7 +23,7 @@ from limsim_jax.bridges.carla.stage import Stage, lanes_showing, set_stage, sign
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, project, relative
 from limsim_jax.policies.base import PolicyLike
 from limsim_jax.simulation.rollout import Rollout, started
-from limsim_jax.simulation.trace import Trace, trace
+from limsim_jax.simulation.trace import Trace, moment, trace
 from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config, State
@@ -225,7 +225,9 @@ class EnvShow:
         check_step(backend, env.config.dt)
         self.env, self._show = env, Show(backend)
         self._last: Trace | None = None
-        self._snapshot = jax.jit(partial(_snapshot, env.config))
+        self._snapshot = jax.jit(
+            lambda lanes, state: moment(state, env.config.time(state.step), boxes(lanes, state))
+        )
 
     def state(self, state: EnvState) -> int:
         """Show the way from the state before to this one; returns the number of ticks.
@@ -261,24 +263,6 @@ def between(before: Trace, now: Trace, count: int) -> list[Trace]:
         time = before.time + share * (now.time - before.time)
         found.append(before._replace(time=time, active=stays, box=box))
     return [*found, now]
-
-
-def _snapshot(config: Config, lanes: LaneMap, state: State) -> Trace:
-    return Trace(
-        time=config.time(state.step),
-        active=state.active,
-        vehicle=state.vehicle,
-        lane=state.lane,
-        s=state.s,
-        d=state.d,
-        v=state.v,
-        a=state.a,
-        box=boxes(lanes, state),
-        status=state.status,
-        phase=state.lights.phase,
-        vehicle_class=state.shape.vehicle_class,
-        driven=jnp.where(state.active[state.egos.slot], state.egos.slot, -1),
-    )
 
 
 __all__ = ["EnvShow", "Live", "between", "place_ego"]
