@@ -208,9 +208,12 @@ def from_carla(location: Any, yaw: Any) -> tuple[NDArray[Any], NDArray[Any], NDA
 # --- reading ------------------------------------------------------------------------------------------------
 
 
+_MARK = _COUNT.pack(len(MAGIC)) + MAGIC.encode()
+
+
 def is_carla_log(data: bytes) -> bool:
     """Whether a file begins as a recorder log does."""
-    return data[2 : 4 + len(MAGIC)] == _COUNT.pack(len(MAGIC)) + MAGIC.encode()
+    return data[2 : 2 + len(_MARK)] == _MARK
 
 
 def read_log(path: str | Path) -> CarlaLog:
@@ -230,9 +233,10 @@ def parse_log(path: str | Path, data: bytes) -> CarlaLog:
     """
     reader = _Reader(str(path), data)
     (version,) = reader.unpack(_COUNT, "the version")
-    magic = reader.text("the mark of a recorder log")
-    if magic != MAGIC:
-        raise reader.error(f"the mark is '{magic[:20]}'; {MAGIC} is expected", 2)
+    if not _MARK.startswith(data[2 : 2 + len(_MARK)]):
+        mark = data[4 : 2 + len(_MARK)].decode(errors="replace")
+        raise reader.error(f"the mark is {mark!r}; {MAGIC}, of a recorder log of CARLA, is expected", 2)
+    reader.text("the mark of a recorder log")
     if version != 1:
         raise reader.error(f"version {version}; version 1 is expected", 0)
     (date,) = reader.unpack(struct.Struct("<q"), "the date")

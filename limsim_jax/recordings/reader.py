@@ -163,7 +163,8 @@ def read_tracks(
             raise RecordingError(f"{path}: a log of CARLA has neither `scenario` nor `span`")
         return read_carla_tracks(path, data, network, dt)
     if network is not None or dt is not None:
-        raise RecordingError(f"{path}: map, dt: expected of a log of CARLA, and of no other recording")
+        message = "map, dt: expected of a log of CARLA, and of no other recording; it is none"
+        raise RecordingError(f"{path}: {message}")
     platoon = not _is_xml(data) and header_of(data)[0] in ("Date", "Vehicle_order")
     if platoon != (span is not None):
         raise RecordingError(

@@ -139,6 +139,8 @@ def test_a_hostile_log_ends_in_one_line(written):
     ("change", "message"),
     [
         (lambda d, b: d[:2] + d[2:].replace(b"CARLA_RECORDER", b"CARLA_RECORDEX", 1), "byte 2: the mark is"),
+        (lambda d, b: b"time,x,y\n" * 9, r"byte 2: the mark is ',x,y.*'; CARLA_RECORDER, of a recorder log"),
+        (lambda d, b: b"hello\n", r"byte 2: the mark is 'o.*'; CARLA_RECORDER, of a recorder log"),
         (lambda d, b: b"\x02\x00" + d[2:], "byte 0: version 2; version 1 is expected"),
         (lambda d, b: d[:b], "no frames"),
         (lambda d, b: d[:b] + b"\x06" + d[b + 1 :], r"packet 6 of 24 bytes; the start of a frame"),
