@@ -4,7 +4,8 @@
     python experiments/sumo_bridge.py --full
     python experiments/sumo_bridge.py --only-cost
 
-`--full`: 50 seeds, 120 s, both planners, five networks. A seed draws a car of the scenario's own demand;
+`--full`: 50 seeds, 120 s, both planners, five networks. `--out DIR` keeps the worlds, and the same command
+goes on where it was stopped. The costs of the bridge are measured once, or by `--only-cost`. A seed draws a car of the scenario's own demand;
 the planner takes it over within its first minutes. For both drivers it is the same car, at the same moment,
 among the same vehicles: SUMO drives them on, or we take all of them over. SUMO inserts vehicles, says their
 routes and owns the signals in both. Writes experiments/results/sumo_bridge.json and .md. Needs shared data,
@@ -42,10 +43,12 @@ ALL: tuple[str, ...] = (
     "ingolstadt1",
     "limsim_roundabout",
     "bologna_pasubio",
-    "limsim_town05",
     "limsim_bigInter",
+    "limsim_town05",
 )
 COLUMNS = ("success", "nuplan_score", "at_fault_contacts", "completion", "mean_speed", "sumo_collisions")
+CHUNK = 10  # worlds at the same time
+KEPT = 24  # decisions that are timed
 WARM = 1200  # steps until there are vehicles to read
 STEPS = 200  # that are timed
 EVERY = 10  # decisions of a world, of which one is timed
@@ -60,6 +63,7 @@ def config(net: str, folder: Path) -> Path:
     network = next((DATA / net).glob("*.net.xml"))
     routes = sorted((DATA / net).glob("*.rou.xml"), key=lambda x: "vtypes" not in x.name)
     path = folder / f"{net}.sumocfg"
+    folder.mkdir(parents=True, exist_ok=True)
     path.write_text(
         f'<configuration><net-file value="{network}"/>'
         f'<route-files value="{",".join(map(str, routes))}"/></configuration>'
@@ -76,26 +80,27 @@ def figures(episodes: dict[str, list[Any]]) -> dict[str, Any]:
     return found | {"seeds": good.size, "success_low": low, "success_high": high, "sumo_echo": echo}
 
 
-def watched(world: lj.SumoWorld, kept: list[Any]) -> None:
-    """Keep every `EVERY`th decision of the first world."""
+def decision_ms(world: lj.SumoWorld) -> float:
+    """Median time of a decision of the policy alone: of the processor, so other work does not count.
+
+    It decides in states of the world of seed 0: the first ones, every `EVERY`th.
+    """
     episodes: Any = world.episodes
     start, tick, finish = episodes._compiled
+    kept: list[Any] = []
     calls = 0
 
     def keeping(lanes: Any, carry: Any, *more: Any) -> Any:
         nonlocal calls
         found = tick(lanes, carry, *more)
-        if calls % (EVERY * episodes.experiment.decision_every) == 0:
+        if len(kept) < KEPT and calls % (EVERY * episodes.experiment.decision_every) == 0:
             kept.append((lanes, *jax.tree.map(lambda x: x[0], (found[0].state, found[0].memory))))
         calls += 1
         return found
 
     episodes._compiled = start, keeping, finish
-
-
-def decision_ms(world: lj.SumoWorld, kept: list[Any]) -> float:
-    """Median time of a decision of the policy alone: of the processor, so other work does not count."""
-    program: Any = world.episodes.program
+    episodes.run([0])
+    program: Any = episodes.program
     decide = jax.jit(partial(sighted(program.policy), program.planning), compiler_options=run_often())
     key, times = jax.random.key(0), []
     for case in kept:
@@ -113,22 +118,22 @@ def rows(
     """A row for each kind of drivers, per network and planner."""
     for net in nets:
         for name in policies:
-            compiled, kept, seen = None, [], []
+            compiled, seen = None, []
             for drivers in ("sumo", "ours"):
                 world = lj.SumoWorld(
                     config(net, folder), policy=name, horizon=horizon, drivers=drivers, name=net,
-                    chunk=min(seeds, 4),
+                    chunk=min(seeds, CHUNK),
                 )  # fmt: skip
                 episodes: Any = world.episodes
                 if compiled is None:
                     compiled = episodes._compiled
                 episodes._compiled = compiled  # one program for both kinds of drivers
-                watched(world, kept if drivers == "sumo" else [])
-                out = folder / f"{net}-{name}-{drivers}"
-                table = world.sweep(seeds, out, progress=False).episodes.to_pydict()
-                seen.append(figures(table) | {"net": net, "policy": name, "drivers": drivers})
+                table = world.sweep(seeds, folder / f"{net}-{name}-{drivers}", progress=False)
+                seen.append(figures(table.episodes.to_pydict()))
+                seen[-1] |= {"net": net, "policy": name, "drivers": drivers}
                 print(seen[-1], flush=True)
-            yield [row | {"decision_ms": decision_ms(world, kept)} for row in seen]
+            time_ms = decision_ms(world)
+            yield [row | {"decision_ms": time_ms} for row in seen]
 
 
 def cost(path: str) -> dict[str, Any]:
@@ -218,6 +223,7 @@ def main() -> None:
     parser.add_argument("--policies", default="pdm_closed")
     parser.add_argument("--horizon", type=float, default=60.0)
     parser.add_argument("--full", action="store_true")
+    parser.add_argument("--out", type=Path, help="folder that keeps the worlds")
     parser.add_argument("--only-cost", action="store_true")
     given = parser.parse_args()
     nets, policies = given.nets.split(","), given.policies.split(",")
@@ -227,12 +233,14 @@ def main() -> None:
     path = RESULTS / "sumo_bridge.json"
     found = json.loads(path.read_text()) if path.exists() else {"rows": [], "horizon": horizon, "cost": []}
     with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) if given.out is None else given.out
         if not given.only_cost:
             found |= {"rows": [], "horizon": horizon}
-            for more in rows(nets, policies, seeds, horizon, Path(folder)):
+            for more in rows(nets, policies, seeds, horizon, out):
                 found["rows"] += more
                 save(path, found)
-        found["cost"] = costs(["ingolstadt1", "bologna_pasubio", "limsim_town05"], Path(folder))
+        if given.only_cost or not found["cost"]:
+            found["cost"] = costs(["ingolstadt1", "bologna_pasubio", "limsim_town05"], out)
     save(path, found)
     print(markdown(found))
 

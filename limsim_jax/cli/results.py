@@ -86,7 +86,7 @@ def sweep(
     engine: Annotated[
         Literal["limsim", "sumo"],
         typer.Option(
-            help="What drives the other vehicles: limsim, or SUMO itself (a .sumocfg; extra 'sumo')."
+            help="Who runs the traffic: limsim, or SUMO itself (a .sumocfg; extra 'sumo')."
         ),
     ] = "limsim",
     ego: Annotated[
@@ -98,6 +98,10 @@ def sweep(
     ] = None,
     horizon: Annotated[
         float | None, typer.Option(help="With SUMO: s that an ego has for its trip.  [default: 180]")
+    ] = None,
+    drivers: Annotated[
+        Literal["sumo", "ours"] | None,
+        typer.Option(help="With SUMO: who drives the other vehicles.  [default: sumo]"),
     ] = None,
     on_error: Annotated[
         Literal["record", "stop"],
@@ -122,7 +126,7 @@ def sweep(
         raise typer.BadParameter(f"{workers}; at least 1", param_hint="--workers")
     if fresh and part is not None:
         raise typer.BadParameter("it would remove the results of other shards", param_hint="--fresh")
-    in_sumo = {"--ego": ego, "--horizon": horizon}
+    in_sumo = {"--ego": ego, "--horizon": horizon, "--drivers": drivers}
     if engine == "sumo":
         _not_with_sumo({"--map": map_file, "--workers": workers})
         experiments: list[ExperimentFile] = []
@@ -140,7 +144,7 @@ def sweep(
 
     kept: dict[tuple[str, str], int] = {}
     if engine == "sumo":
-        made = [_sumo_episodes(experiment, policy, ego, horizon, chunk)]
+        made = [_sumo_episodes(experiment, policy, ego, horizon, drivers, chunk)]
     else:
         made = build(experiments, chunk) if workers is None else []
     try:
@@ -434,9 +438,14 @@ def _not_with_sumo(options: dict[str, Any]) -> None:
 
 
 def _sumo_episodes(
-    config: str, policy: str | None, ego: str | None, horizon: float | None, chunk: int | None
+    config: str,
+    policy: str | None,
+    ego: str | None,
+    horizon: float | None,
+    drivers: Literal["sumo", "ours"] | None,
+    chunk: int | None,
 ) -> Any:
-    """The worlds of a `.sumocfg` that SUMO drives."""
+    """The worlds of a `.sumocfg` that SUMO runs."""
     from limsim_jax.bridges.sumo.world import HORIZON, SumoWorld
 
     return SumoWorld(
@@ -444,6 +453,7 @@ def _sumo_episodes(
         policy="limsim_tm" if policy is None else policy,
         ego=None if ego is None else ego.split(","),
         horizon=HORIZON if horizon is None else horizon,
+        drivers="sumo" if drivers is None else drivers,
         chunk=chunk,
     ).episodes
 
