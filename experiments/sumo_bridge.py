@@ -5,11 +5,12 @@
     python experiments/sumo_bridge.py --only-cost
 
 `--full`: 50 seeds, 120 s, both planners, five networks. `--out DIR` keeps the worlds, and the same command
-goes on where it was stopped. The costs of the bridge are measured once, or by `--only-cost`. A seed draws a car of the scenario's own demand;
-the planner takes it over within its first minutes. For both drivers it is the same car, at the same moment,
-among the same vehicles: SUMO drives them on, or we take all of them over. SUMO inserts vehicles, says their
-routes and owns the signals in both. Writes experiments/results/sumo_bridge.json and .md. Needs shared data,
-and the extra `sumo`.
+goes on where it was stopped. The costs of the bridge are measured once, or by `--only-cost`.
+
+A seed draws a car of the scenario's own demand; the planner takes it over within its first minutes. For both
+drivers it is the same car, at the same moment, among the same vehicles: SUMO drives them on, or we take all
+of them over. SUMO inserts vehicles, says their routes and owns the signals in both. Writes
+experiments/results/sumo_bridge.json and .md. Needs shared data, and the extra `sumo`.
 """
 
 from __future__ import annotations
