@@ -20,7 +20,7 @@ from limsim_jax.log_replay.replay import Replay
 from limsim_jax.log_replay.takeover import Ego, Moment, Record, Takeover, braking, replay, replay_many
 from limsim_jax.maps.map import Map, load_map
 from limsim_jax.maps.network import Network
-from limsim_jax.policies.base import Policy
+from limsim_jax.policies.base import Policy, with_scenery
 from limsim_jax.recordings import Tracks, read_tracks
 from limsim_jax.recordings.lanelets import SPEED_LIMIT
 
@@ -121,7 +121,9 @@ class Scene:
         starts = self._starts(slots, start)
         told = 0.0 if policy is None and braking is None else duration or _FOREVER
         egos = _egos(self.arrays, jnp.asarray(slots), jnp.asarray(starts), jnp.asarray(rates), told)
-        pilot = None if policy is None else PolicyPilot(lane_map=self.map.lanes, policy=policy)
+        pilot = (
+            None if policy is None else PolicyPilot(lane_map=with_scenery(policy, self.map), policy=policy)
+        )
         keys = jax.random.split(jax.random.key(seed), len(slots))
         options = takeover or Takeover()
 

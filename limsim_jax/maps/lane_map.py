@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +39,9 @@ from limsim_jax.maps.route_table import RouteTable
 from limsim_jax.maps.signal_table import SignalTable
 from limsim_jax.numerics import safe_divide, safe_sqrt
 from limsim_jax.xla import computed_once
+
+if TYPE_CHECKING:
+    from limsim_jax.maps.scenery import Scenery
 
 NO_LANE = -1
 """Row of the null lane."""
@@ -104,6 +107,7 @@ class LaneMap:
     conflicts: ConflictTable
     routes: RouteTable
     signals: SignalTable
+    scenery: Scenery | None = None  # what sensors see of the map, where a policy needs it
     lanes_in_sight: int = struct.field(pytree_node=False, default=0)
     """Lanes that a vehicle may have to scan to see `rasterise.SIGHT` m ahead."""
     lanes_behind: int = struct.field(pytree_node=False, default=2)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Key
 
 from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.maps.map import Map
 from limsim_jax.policies.predict import Predictor
 from limsim_jax.policies.view import View, view_of
 from limsim_jax.traffic.command import Command
@@ -61,8 +62,9 @@ class Policy(ABC):
                 ...
                 return Command(trajectory=trajectory), memory
 
-    Class attributes: `free`, whether egos move in the plane (otherwise they keep to lanes), and `others`, the
-    number of vehicles that it can drive beside the egos.
+    Class attributes: `free`, whether egos move in the plane (otherwise they keep to lanes); `others`, the
+    number of vehicles that it can drive beside the egos; and `needs_scenery`, whether it looks at
+    `lane_map.scenery`, what sensors see of the map.
 
     Attributes:
       name: of the policy in results; None: that of the class, see `policy_name`.
@@ -76,6 +78,7 @@ class Policy(ABC):
 
     free = True
     others = 0
+    needs_scenery = False
     default_name: ClassVar[str | None] = None
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
@@ -207,15 +210,36 @@ def views(policy: Any) -> list[View]:
     Raises:
       ValueError: a view that is none.
     """
-    inner = [getattr(policy, name, None) for name in ("policy", "around", "ego")]
-    inner += getattr(policy, "policies", ())
-    found = [view for one in inner if isinstance(one, PolicyLike) for view in views(one)]
+    found = [view for one in _inner(policy) for view in views(one)]
     if getattr(policy, "privileged", False):
         return found
     view = getattr(policy, "view", View())
     if not isinstance(view, View):
         raise ValueError(f"view is {view!r}; expected a limsim_jax.View, or a table in a file")
     return [*found, view]
+
+
+def _inner(policy: Any) -> list[Any]:
+    """The policies in a policy."""
+    inner = [getattr(policy, name, None) for name in ("policy", "around", "ego")]
+    return [one for one in (*inner, *getattr(policy, "policies", ())) if isinstance(one, PolicyLike)]
+
+
+def needs_scenery(policy: Any) -> bool:
+    """Whether a policy, or one in it, looks at `lane_map.scenery`."""
+    return bool(getattr(policy, "needs_scenery", False)) or any(map(needs_scenery, _inner(policy)))
+
+
+def with_scenery(policy: Any, town: Map, lane_map: LaneMap | None = None) -> LaneMap:
+    """The arrays of a map as a policy needs them: with `scenery` if it needs that.
+
+    Args:
+      policy: that drives on the map.
+      town: the map.
+      lane_map: its arrays; None: those of the map.
+    """
+    lanes = town.lanes if lane_map is None else lane_map
+    return replace(lanes, scenery=town.scenery) if needs_scenery(policy) else lanes
 
 
 def knows(policy: Any) -> str:

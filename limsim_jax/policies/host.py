@@ -273,6 +273,11 @@ class HostPolicy(Policy):
         return self.command != "meta"
 
     @property
+    def needs_scenery(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether `observe` says so."""
+        return bool(getattr(self.observe, "needs_scenery", False))
+
+    @property
     def default_name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The name of the function."""
         return snake_case(getattr(self.function, "__name__", type(self.function).__name__))

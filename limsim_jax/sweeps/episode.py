@@ -30,7 +30,7 @@ from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos, EvaluateTraffic
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.policies.area import PARTS
-from limsim_jax.policies.base import PolicyLike, check_policy, knows, policy_name, views
+from limsim_jax.policies.base import PolicyLike, check_policy, knows, policy_name, views, with_scenery
 from limsim_jax.policies.host import failure_reasons
 from limsim_jax.policies.several import Several
 from limsim_jax.simulation.ending import Watch
@@ -169,10 +169,11 @@ class Episodes:
         """The map on the host."""
         return self.town.network
 
-    @property
+    @cached_property
     def lane_map(self) -> LaneMap:
-        """The map on the device."""
-        return self.town.lanes if self._sumo is None else self._sumo.lane_map
+        """The map on the device, with what the policy needs of it."""
+        own = None if self._sumo is None else self._sumo.lane_map
+        return with_scenery(self._policy, self.town, own)
 
     def under(self, policy: PolicyLike) -> Episodes:
         """The same worlds under another policy."""

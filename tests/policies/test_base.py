@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from traffic_worlds import bundled, scattered
 
+from limsim_jax.maps.map import load_map
 from limsim_jax.policies import POLICIES
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import (
@@ -19,13 +20,16 @@ from limsim_jax.policies.base import (
     check_policy,
     memory_rows,
     named,
+    needs_scenery,
     policy_name,
     renew_rows,
+    with_scenery,
 )
 from limsim_jax.policies.host import HostPolicy
 from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.pdm import PDMClosed
 from limsim_jax.policies.reference import reference_path
+from limsim_jax.policies.several import Several
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Control, from_lane
@@ -242,3 +246,23 @@ def test_exceptions_of_a_policy_pass_unchanged():
 
     with pytest.raises(RuntimeError, match="no plan"):
         check_policy(Wrong(fails), CONFIG, *world())
+
+
+@dataclass(frozen=True)
+class Looks(LikeTraffic):
+    needs_scenery = True
+
+
+def test_a_policy_that_looks_gets_the_scenery_however_deep_it_is():
+    town = load_map("highway")
+    for policy in (
+        Looks(),
+        AreaOfInterest(ego=Looks()),
+        Several((LikeTraffic(), Looks())),
+        named("x", Looks()),
+    ):
+        assert needs_scenery(policy)
+        lanes = with_scenery(policy, town)
+        assert lanes.scenery is town.scenery and lanes.length is town.lanes.length
+    assert with_scenery(AreaOfInterest(), town) is town.lanes and town.lanes.scenery is None
+    assert needs_scenery(HostPolicy(lambda seen: {}, observe=Looks()))  # pyright: ignore[reportArgumentType]

@@ -29,7 +29,7 @@ from limsim_jax.metrics.catalog import TOTALS
 from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos
 from limsim_jax.metrics.reductions import on_host
-from limsim_jax.policies.base import PolicyLike, views
+from limsim_jax.policies.base import PolicyLike, views, with_scenery
 from limsim_jax.simulation.rollout import world_key
 from limsim_jax.simulation.trace import Trace
 from limsim_jax.sweeps.build import map_of, policy_of, traffic_of, with_view
@@ -157,7 +157,7 @@ class SumoEpisodes:
         self._ways = Ways(self._town.network, self._town.lanes, WAYS * experiment.slots * self.chunk + 1)
         self._lights: Lights | None = None
         self._places: Places | None = None
-        self._map = self._town.lanes
+        self._map = with_scenery(self._policy, self._town)
         self.seconds: dict[str, list[float]] = {"decide": [], "drive": []}
         """s per world that ticks took: those with a decision of the policy, and those without."""
 
