@@ -243,7 +243,7 @@ def with_scenery(policy: Any, town: Map, lane_map: LaneMap | None = None) -> Lan
 
 
 def knows(policy: Any) -> str:
-    """What a policy knows of other vehicles: "state" or "view"."""
+    """What a policy knows of other vehicles: "state", "view" or "sensors"."""
     told = getattr(policy, "knows", None)
     return told or ("state" if getattr(policy, "privileged", False) else "view")
 

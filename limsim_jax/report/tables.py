@@ -346,11 +346,11 @@ KNOWS = "knows of other vehicles"
 
 
 def knows(results: Results, group: Group) -> str:
-    """What the policy of a group knows: all (the state) or what it sees (a view).
+    """What the policy of a group knows: all, what it sees, or what its sensors give.
 
     Empty without an ego, and in results that do not say it.
     """
-    words = {"state": "all", "view": "what it sees"}
+    words = {"state": "all", "view": "what it sees", "sensors": "what its sensors give"}
     return words.get(provenance_of(results, group).get("knows", ""), "")
 
 
