@@ -49,6 +49,8 @@ from .policies.simple import ConstantSpeed as ConstantSpeed
 from .policies.simple import FollowLane as FollowLane
 from .policies.vector import ObserveVector as ObserveVector
 from .policies.view import View as View
+from .rare_events.estimate import RareEvent as RareEvent
+from .rare_events.estimate import rare_event as rare_event
 from .report import plots as plots
 from .sensors.objects import Detector as Detector
 from .sensors.rig import Camera as Camera

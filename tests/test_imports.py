@@ -21,6 +21,7 @@ ORDER = [
     {"standards"},
     {"types"},
     {"statistics"},
+    {"rare_events"},
     {"maps"},
     {"traffic", "recordings"},
     {"sensors"},

@@ -25,6 +25,7 @@ NAMES = {
         "ExperimentError",
     ],
     "Sweeps": ["sweep", "Results", "Row", "open_results", "Metric", "ResultsError"],
+    "Rare events": ["rare_event", "RareEvent"],
     "Policies": [
         *("LikeTraffic", "ConstantSpeed", "FollowLane", "PDMClosed", "PDMHybrid", "LimSimTM"),
         *("AreaOfInterest", "named"),
