@@ -52,6 +52,8 @@ from .policies.view import View as View
 from .rare_events.estimate import RareEvent as RareEvent
 from .rare_events.estimate import rare_event as rare_event
 from .report import plots as plots
+from .scenarios.openscenario.scenario import openscenario as openscenario
+from .scenarios.openscenario.source import OpenScenarioError as OpenScenarioError
 from .sensors.objects import Detector as Detector
 from .sensors.rig import Camera as Camera
 from .sensors.rig import Lidar as Lidar

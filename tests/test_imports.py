@@ -29,6 +29,7 @@ ORDER = [
     {"simulation"},
     {"metrics"},
     {"sweeps", "calibration"},
+    {"scenarios"},
     {"training"},
     {"report"},
     {"api"},

@@ -24,6 +24,7 @@ NAMES = {
         *("Experiment", "Flow", "Ego", "bundled_experiments", "load_experiments", "World", "Futures"),
         "ExperimentError",
     ],
+    "Scenarios of other tools": ["openscenario", "OpenScenarioError"],
     "Sweeps": ["sweep", "Results", "Row", "open_results", "Metric", "ResultsError"],
     "Rare events": ["rare_event", "RareEvent"],
     "Policies": [

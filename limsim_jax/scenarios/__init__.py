@@ -1,0 +1,1 @@
+"""Scenarios of other tools as worlds of ours."""
