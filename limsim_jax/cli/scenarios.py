@@ -31,7 +31,7 @@ def check(
     lenient: LenientOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Read a scenario, say what is in it and what is left out."""
+    """Say what is in a scenario, and what is left out."""
     from limsim_jax.scenarios.openscenario.scenario import openscenario
 
     found = openscenario(file, lenient=lenient, root=root)
