@@ -12,6 +12,7 @@ from .api.map import Map as Map
 from .api.map import load_map as load_map
 from .api.results import Results as Results
 from .api.results import open_results as open_results
+from .api.sensed import Film as Film
 from .api.sensed import Sensed as Sensed
 from .api.sweep import sweep as sweep
 from .api.world import World as World
@@ -54,6 +55,7 @@ from .rare_events.estimate import rare_event as rare_event
 from .report import plots as plots
 from .scenarios.openscenario.scenario import openscenario as openscenario
 from .scenarios.openscenario.source import OpenScenarioError as OpenScenarioError
+from .sensors.faults import Faults as Faults
 from .sensors.objects import Detector as Detector
 from .sensors.rig import Camera as Camera
 from .sensors.rig import Lidar as Lidar

@@ -35,7 +35,7 @@ NAMES = {
         *("Policy", "HostPolicy", "Observation", "Command", "Control", "Trajectory"),
         *("reference_path", "to_cartesian"),
     ],
-    "Sensors": ["Camera", "Lidar", "Rig", "six_cameras", "Detector", "Sensed"],
+    "Sensors": ["Camera", "Lidar", "Rig", "six_cameras", "Detector", "Faults", "Sensed", "Film"],
     "Step by step": ["Env", "ObserveVector", "RouteReward"],
     "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "Population", "default_population"],
     "Log replay": ["load_scene", "Scene"],

@@ -17,7 +17,7 @@ from limsim_jax.simulation.trace import Trace
 
 if TYPE_CHECKING:
     from limsim_jax.api.futures import Futures
-    from limsim_jax.api.sensed import Sensed
+    from limsim_jax.api.sensed import Film, Sensed
     from limsim_jax.policies.base import PolicyLike
     from limsim_jax.sensors.rig import Rig
     from limsim_jax.sweeps.episode import Episodes
@@ -101,10 +101,11 @@ class World:
 
         Args:
           path: .html (viewer), .mp4 or .gif (video), .png (picture), .parquet or .npz (every step).
-          options: of `report.viewer.write_viewer`, `report.video.write_video` or `write_picture`.
+          options: of `report.viewer.write_viewer`, `report.video.write_video` or `write_picture`. In all
+            three `sensors` shows what the ego senses, too: a `Film`, a `Rig`, or a name as in `film`.
 
         Raises:
-          ValueError: another suffix.
+          ValueError: another suffix, or sensors that are not there.
         """
         path = Path(path)
         suffix = path.suffix.lower()
@@ -116,6 +117,8 @@ class World:
         if suffix in (".gif", ".mp4", ".png"):
             follow = self.ego if egos and options.get("bounds") is None else None
             options = {"follow": follow, "egos": egos, "moments": self.moments} | options
+        if options.get("sensors") is not None and suffix not in (".parquet", ".npz"):
+            options = options | {"sensors": self._watched(options["sensors"])}
         if suffix == ".html":
             from limsim_jax.report.viewer import write_viewer
 
@@ -149,6 +152,28 @@ class World:
         from limsim_jax.api.sensed import sense
 
         return sense(self, at, rig, **options)
+
+    def film(self, rig: Rig | str = "six", **options: Any) -> Film:
+        """What the ego senses over the episode, a frame per decision: arrays, and a video.
+
+        Args:
+          rig: its cameras and LiDAR; or `six`, `front` or `one` cameras with a LiDAR, or `own`: the rig that
+            the policy declares.
+          options: `every` (s between frames), `begin` and `end` (s), `slot` of another vehicle, `detector`,
+            `raster` and `faults` (see `sensors`).
+
+        Raises:
+          ValueError: an unknown rig, a policy without sensors, or no frame with that vehicle.
+        """
+        from limsim_jax.api.sensed import film
+
+        return film(self, rig, **options)
+
+    def _watched(self, sensors: Film | Rig | str) -> Film:
+        """A film of few frames, to be shown beside the traffic."""
+        from limsim_jax.api.sensed import Film, watch
+
+        return sensors if isinstance(sensors, Film) else watch(self, sensors)
 
     def fork(
         self,

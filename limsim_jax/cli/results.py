@@ -85,9 +85,7 @@ def sweep(
     ] = None,
     engine: Annotated[
         Literal["limsim", "sumo"],
-        typer.Option(
-            help="Who runs the traffic: limsim, or SUMO itself (a .sumocfg; extra 'sumo')."
-        ),
+        typer.Option(help="Who runs the traffic: limsim, or SUMO itself (a .sumocfg; extra 'sumo')."),
     ] = "limsim",
     ego: Annotated[
         str | None,
@@ -326,9 +324,18 @@ def replay(
     bounds: Annotated[
         str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="A fixed view of this area instead, m.")
     ] = None,
+    sensors: Annotated[
+        Literal["six", "front", "one", "own"] | None,
+        typer.Option(
+            help="Show what the ego senses beside the traffic: six, front (three) or one camera with LiDAR, "
+            "bird's-eye view and object list; own: the sensors of the policy. A frame per decision, at most "
+            "240 in an episode, in about 1 MB."
+        ),
+    ] = None,
 ) -> None:
     """Run one world of the results again and show it."""
     from limsim_jax.api.results import rebuild
+    from limsim_jax.api.sensed import check_sensors, watch
     from limsim_jax.api.world import World
     from limsim_jax.sweeps.store import open_results
 
@@ -344,6 +351,7 @@ def replay(
     options = {
         "--at": (at, still), "--from": (begin, moving), "--to": (end, moving),
         "--follow": (follow, still or moving), "--bounds": (bounds, still or moving),
+        "--sensors": (sensors, still or moving or path.suffix == ".html"),
     }  # fmt: skip
     for name, (value, fits) in options.items():
         if value is not None and not fits:
@@ -355,7 +363,12 @@ def replay(
         )
     stored = _known(opened, group, seed)
     path.parent.mkdir(parents=True, exist_ok=True)
-    world = World.run(rebuild(opened, *group), seed)
+    episodes = rebuild(opened, *group)
+    if sensors is not None:
+        if not episodes.egos:
+            raise typer.BadParameter(f"'{group[0]}' has no ego", param_hint="--sensors")
+        check_sensors(episodes, sensors)
+    world = World.run(episodes, seed)
     for row in world.moments:
         value = "" if math.isnan(row["value"]) else f", {row['value']:.2f}"
         value += f": {row['reason']}" if row.get("reason") else ""
@@ -365,7 +378,10 @@ def replay(
         module = f", avoided by a reference {row['module']} module" if row.get("module") else ""
         print(f"{row['time']:6.1f} s  {row['kind']}{value}{who}{saved}{module}")
     _tell_differences(world.metrics, stored)
-    given = {"at": at, "begin": begin, "end": end, "follow": follow, "bounds": area}
+    given: dict[str, Any] = {"at": at, "begin": begin, "end": end, "follow": follow, "bounds": area}
+    if sensors is not None:
+        given["sensors"] = film = watch(world, sensors)
+        print(f"{film!r}, one every {film.spacing:g} s")
     world.save(path, **{name: value for name, value in given.items() if value is not None})
     print(f"wrote {path}")
 

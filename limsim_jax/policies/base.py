@@ -17,6 +17,7 @@ from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.map import Map
 from limsim_jax.policies.predict import Predictor
 from limsim_jax.policies.view import View, view_of
+from limsim_jax.sensors.rig import Rig
 from limsim_jax.traffic.command import Command
 from limsim_jax.types import Config, State
 
@@ -240,6 +241,19 @@ def with_scenery(policy: Any, town: Map, lane_map: LaneMap | None = None) -> Lan
     """
     lanes = town.lanes if lane_map is None else lane_map
     return replace(lanes, scenery=town.scenery) if needs_scenery(policy) else lanes
+
+
+def sensors_of(policy: Any) -> Rig | None:
+    """The rig that a policy declares as `sensors` or `rig`.
+
+    It may be that of a policy within it. None: there is none."""
+    for name in ("sensors", "rig"):
+        if isinstance(found := getattr(policy, name, None), Rig):
+            return found
+    for one in _inner(policy):
+        if (found := sensors_of(one)) is not None:
+            return found
+    return None
 
 
 def knows(policy: Any) -> str:

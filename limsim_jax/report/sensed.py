@@ -8,11 +8,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from limsim_jax.maps.scenery import Label
 from limsim_jax.report.draw.painter import INK
-from limsim_jax.sensors.bev import CHANNELS, Raster
-from limsim_jax.sensors.camera import COLORS, Pictures
-from limsim_jax.sensors.lidar import Scan, points_of
+from limsim_jax.report.strip import (
+    BODY_POINT,
+    FALSE,
+    FALSE_BY_DAY,
+    FOUND,
+    FOUND_BY_DAY,
+    GROUND_POINT,
+    NIGHT,
+    REACH,
+    SURFACES,
+    cloud,
+    corners,
+    surfaces,
+)
+from limsim_jax.sensors.bev import Raster
+from limsim_jax.sensors.camera import Pictures
+from limsim_jax.sensors.lidar import Scan
 from limsim_jax.sensors.objects import Objects
 from limsim_jax.sensors.rig import Rig
 
@@ -21,8 +34,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _WIDTH = 12.0  # inches
-_SHOWN = 40.0  # m around the vehicle in the point cloud
-_TRUE, _FALSE = "#0072b2", "#d55e00"
 
 
 def draw_sheet(
@@ -88,20 +99,19 @@ def draw_sheet(
 
 def _draw_points(ax: Axes, rig: Rig, scan: Scan | None, objects: Objects, size: tuple[float, float]) -> None:
     """The point cloud from above, ahead is up; boxes of the object list."""
-    ax.set_facecolor("#14181d")
+    ax.set_facecolor(NIGHT)
     ax.set_aspect("equal")
-    half = _SHOWN * 1.28
+    half = REACH * 1.28
     ax.set_xlim(half, -half)
-    ax.set_ylim(-_SHOWN, _SHOWN)
+    ax.set_ylim(-REACH, REACH)
     words = "no LiDAR"
     if scan is not None and rig.lidar is not None:
-        points, back = points_of(rig.lidar, scan)
-        points, back, slot = np.asarray(points), np.asarray(back), np.asarray(scan.slot)
-        for mask, color, dot in ((back & (slot < 0), "#6c7a89", 0.5), (back & (slot >= 0), "#ffd166", 2.2)):
+        points, back, struck = cloud(rig.lidar, scan)
+        for mask, color, dot in ((back & ~struck, GROUND_POINT, 0.5), (struck, BODY_POINT, 2.2)):
             ax.scatter(points[mask, 1], points[mask, 0], s=dot, c=color, linewidths=0)
         layers = len(rig.lidar.elevations)
         words = f"LiDAR, {layers} layer{'s' * (layers > 1)}: {int(back.sum()):,} points"
-    _boxes(ax, objects, "#7fd1ff", "#ff9d76")
+    _boxes(ax, objects, FOUND, FALSE)
     _own(ax, size, "white")
     ax.set_title(f"{words}, and the object list", fontsize=9, color=INK, loc="left", pad=3)
 
@@ -110,12 +120,7 @@ def _draw_raster(
     ax: Axes, bev: NDArray[Any], raster: Raster, objects: Objects, size: tuple[float, float]
 ) -> None:
     """The bird's-eye view in colours; velocities of the object list as lines of a second."""
-    layer = dict(zip(CHANNELS, np.asarray(bev), strict=True))
-    image = np.full((*layer["drivable"].shape, 3), COLORS[Label.TERRAIN], np.uint8)
-    image[layer["drivable"] > 0] = (150, 154, 160)
-    image[layer["route"] > 0] = (120, 190, 150)
-    image[layer["mark"] > 0] = (245, 245, 240)
-    image[layer["occupied"] > 0] = (44, 92, 160)
+    image = np.asarray(SURFACES, np.uint8)[surfaces(bev)]
     extent = (raster.side, -raster.side, -raster.behind, raster.ahead)
     ax.imshow(image, extent=extent, interpolation="nearest", aspect="equal")
     half = (raster.ahead + raster.behind) / 2 * 1.28
@@ -125,7 +130,7 @@ def _draw_raster(
         x, y, vx, vy = (float(v[k]) for v in (objects.x, objects.y, objects.vx, objects.vy))
         if abs(y) < raster.side and -raster.behind < x < raster.ahead:
             ax.plot([y, y + vy], [x, x + vx], color=INK, lw=1.2)
-    _boxes(ax, objects, _TRUE, _FALSE, clip=raster)
+    _boxes(ax, objects, FOUND_BY_DAY, FALSE_BY_DAY, clip=raster)
     _own(ax, size, INK)
     ax.set_title(
         f"bird's-eye view, {raster.cell:g} m cells; object list with a second of way",
@@ -138,18 +143,11 @@ def _boxes(ax: Axes, objects: Objects, true: str, false: str, clip: Raster | Non
         x, y = float(objects.x[k]), float(objects.y[k])
         if clip is not None and not (abs(y) < clip.side and -clip.behind < x < clip.ahead):
             continue
-        corners = _corners(x, y, *(float(v[k]) for v in (objects.heading, objects.length, objects.width)))
+        box = corners(x, y, *(float(v[k]) for v in (objects.heading, objects.length, objects.width)))
         real = int(objects.id[k]) >= 0
-        ax.plot(corners[:, 1], corners[:, 0], color=true if real else false, lw=1.1, ls="-" if real else ":")
+        ax.plot(box[:, 1], box[:, 0], color=true if real else false, lw=1.1, ls="-" if real else ":")
 
 
 def _own(ax: Axes, size: tuple[float, float], color: str) -> None:
-    corners = _corners(0, 0, 0, *size)
-    ax.fill(corners[:, 1], corners[:, 0], color=color)
-
-
-def _corners(x: float, y: float, heading: float, length: float, width: float) -> NDArray[np.float64]:
-    """Corners of a box, closed, `[5, 2]`."""
-    unit = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1), (1, 1)]) / 2 * (length, width)
-    cos, sin = np.cos(heading), np.sin(heading)
-    return np.array([x, y]) + unit @ np.array([[cos, sin], [-sin, cos]])
+    box = corners(0, 0, 0, *size)
+    ax.fill(box[:, 1], box[:, 0], color=color)

@@ -19,6 +19,7 @@ from limsim_jax.maps.outline import Bounds
 from limsim_jax.report.draw.painter import INK
 from limsim_jax.report.frames import COLLIDED, EGO, SIGNALS, Scene, step_at
 from limsim_jax.report.stills import DPI, Camera, Captions, MapPage
+from limsim_jax.report.strip import FilmLike, Strip, frame_at, palette
 from limsim_jax.simulation.ending import shown_steps
 from limsim_jax.simulation.trace import Trace
 
@@ -39,6 +40,7 @@ def write_picture(
     tail: float = 4.0,
     bounds: Bounds | None = None,
     dpi: float = 1.5 * DPI,
+    sensors: FilmLike | None = None,
 ) -> None:
     """Write one moment as .png, 1,920 pixels wide.
 
@@ -54,6 +56,7 @@ def write_picture(
       tail: s, how far back to show where vehicles came from.
       bounds: x_min, y_min, x_max, y_max of the view, m, instead of the whole map.
       dpi: dots per inch of a picture that is 12.8 inches wide.
+      sensors: what the ego senses, a `Film`: below the traffic.
 
     Raises:
       ValueError: an unknown suffix, an empty trace, a time outside it, or a slot that it does not have.
@@ -69,7 +72,8 @@ def write_picture(
         page: MapPage | Camera = MapPage(network, scene, captions, tail, bounds, dpi)
     else:
         page = Camera(network, scene, captions, follow, tail, dpi)
-    Image.fromarray(next(iter(page.frames([k])))).save(path, format="PNG")
+    frames = _with_sensors(page.frames([k]), scene.time[[k]], sensors)
+    Image.fromarray(next(iter(frames))).save(path, format="PNG")
 
 
 def write_video(
@@ -86,8 +90,11 @@ def write_video(
     begin: float | None = None,
     end: float | None = None,
     bounds: Bounds | None = None,
+    sensors: FilmLike | None = None,
 ) -> None:
     """Write a video, .gif or .mp4, of 1,280 x 720 pixels.
+
+    With sensors it is higher.
 
     With an ego (`follow`, or the first of `egos`) it ends 2 s after that has arrived or left.
 
@@ -104,6 +111,7 @@ def write_video(
       begin: s, the first moment shown; the start of the trace by default.
       end: s, the last moment shown, whatever the ego does.
       bounds: x_min, y_min, x_max, y_max of the view, m, instead of the whole map.
+      sensors: what the ego senses, a `Film`: below the traffic, at each moment the last frame.
 
     Raises:
       ValueError: an unknown suffix, an empty trace, a slot that it does not have, no step between `begin`
@@ -112,11 +120,9 @@ def write_video(
       ModuleNotFoundError: imageio-ffmpeg is not installed and .mp4 is wanted.
     """
     path = Path(path)
-    check_suffix(path, VIDEO_SUFFIXES)
-    if not (fps > 0 and math.isfinite(fps) and every >= 1):
-        raise ValueError(f"{fps:g} frames per second, every {every} steps: both must be above 0")
-    if fps > 100:
-        raise ValueError(f"{fps:g} frames per second: at most 100")
+    if every < 1:
+        raise ValueError(f"every {every} steps: at least 1")
+    check_video(path, fps)
     scene = Scene(network, lane_map, trace, egos if follow is None else {*egos, follow})
     captions = Captions(scene, moments)
     chief = follow if follow is not None else next(iter(egos), None)
@@ -131,8 +137,43 @@ def write_video(
         page: MapPage | Camera = MapPage(network, scene, captions, 0.0, bounds, DPI)
     else:
         page = Camera(network, scene, captions, follow, 0.0, DPI)
-    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
-    write(path, page.frames(range(first, last, every)), fps)
+    steps = range(first, last, every)
+    frames = _with_sensors(page.frames(steps), scene.time[steps], sensors)
+    write_frames(path, frames, fps, None if sensors is None else palette(sensors))
+
+
+def _with_sensors(
+    frames: Iterable[NDArray[np.uint8]], times: NDArray[Any], sensors: FilmLike | None
+) -> Iterator[NDArray[np.uint8]]:
+    """Frames with the strip of the sensors below."""
+    if sensors is None:
+        yield from frames
+        return
+    strip, drawn = None, (-1, np.zeros((0, 0, 3), np.uint8))
+    for pixels, time in zip(frames, times, strict=True):
+        strip = strip or Strip(sensors, pixels.shape[1])
+        if (k := frame_at(sensors.time, float(time))) != drawn[0]:
+            drawn = k, strip.draw(k)
+        yield np.concatenate([pixels, drawn[1]])
+
+
+def check_video(path: Path, fps: float) -> None:
+    """Raise `ValueError` unless a video can be written like this; `ModuleNotFoundError` if a writer lacks."""
+    check_suffix(path, VIDEO_SUFFIXES)
+    if not (fps > 0 and math.isfinite(fps)):
+        raise ValueError(f"{fps:g} frames per second: it must be above 0")
+    if fps > 100:
+        raise ValueError(f"{fps:g} frames per second: at most 100")
+
+
+def write_frames(
+    path: Path, frames: Iterator[NDArray[np.uint8]], fps: float, colors: NDArray[np.uint8] | None = None
+) -> None:
+    """Write frames as .gif or .mp4; `colors` `[K, 3]` are some that a .gif has to show."""
+    if path.suffix.lower() == ".gif":
+        _write_gif(path, frames, fps, colors)
+    else:
+        _write_mp4(path, frames, fps)
 
 
 def check_suffix(path: str | Path, known: Sequence[str]) -> None:
@@ -157,7 +198,9 @@ def _need(module: str, extra: str) -> None:
         ) from None
 
 
-def _write_gif(path: Path, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
+def _write_gif(
+    path: Path, frames: Iterator[NDArray[np.uint8]], fps: float, more: NDArray[np.uint8] | None
+) -> None:
     from matplotlib import colormaps
     from matplotlib.colors import to_rgb
     from PIL import Image
@@ -167,7 +210,8 @@ def _write_gif(path: Path, frames: Iterator[NDArray[np.uint8]], fps: float) -> N
     # every colour that traffic may get.
     named = [to_rgb(color) for color in (*SIGNALS.values(), EGO, COLLIDED, INK)]
     colors = np.concatenate([colormaps["viridis"](np.linspace(0, 1, 48))[:, :3], named])
-    rows = np.repeat(np.uint8(255 * colors), -(-first.shape[1] // len(colors)), 0)[: first.shape[1]]
+    colors = np.concatenate([(255 * colors).astype(np.uint8), *([] if more is None else [more])])
+    rows = np.repeat(colors, -(-first.shape[1] // len(colors)), 0)[: first.shape[1]]
     sample = np.concatenate([first, np.repeat(rows[None], max(1, len(first) // 4), 0)])
     palette = Image.fromarray(sample).quantize(256, method=Image.Quantize.MEDIANCUT)
 

@@ -84,8 +84,8 @@ class Faults:
         rig.check(*self.dropped, *self.frozen)
         always = [name in (*self.dropped, *self.frozen) for name in rig.names]
         return FaultMemory(
-            left=jnp.where(jnp.asarray(always), jnp.inf, 0).astype(jnp.float32),
-            frozen=jnp.asarray([name in self.frozen for name in rig.names]),
+            left=jnp.where(jnp.asarray(always, bool), jnp.inf, 0).astype(jnp.float32),
+            frozen=jnp.asarray([name in self.frozen for name in rig.names], bool),
             last=first,
             drift=jnp.zeros(3, jnp.float32),
         )
@@ -95,7 +95,7 @@ class Faults:
         memory: FaultMemory,
         pictures: Pictures,
         pose: Pose,
-        dt: float,
+        dt: float | Float[Array, ""],
         key: Key[Array, ""],
         step: Int[Array, ""] | int,
     ) -> tuple[Pictures, Pose, FaultMemory]:
@@ -114,7 +114,7 @@ class Faults:
         left, frozen = jnp.maximum(memory.left - dt, 0), memory.frozen
         rate = self.drop_rate + self.freeze_rate
         if rate > 0:
-            begins = (left == 0) & jax.random.bernoulli(keys[0], -math.expm1(-rate * dt), (cameras,))
+            begins = (left == 0) & jax.random.bernoulli(keys[0], -jnp.expm1(-rate * dt), (cameras,))
             freezes = jax.random.bernoulli(keys[1], self.freeze_rate / rate, (cameras,))
             lasts = jax.random.uniform(
                 keys[2], (cameras,), jnp.float32, minval=self.shortest, maxval=self.longest
@@ -136,6 +136,6 @@ class Faults:
         )
         walk = jax.random.normal(key_of(key, step, Purpose.DRIFT), (3,), jnp.float32)
         size = jnp.asarray([self.position_drift, self.position_drift, self.yaw_drift], jnp.float32)
-        drift = memory.drift + walk * size * math.sqrt(dt)
+        drift = memory.drift + walk * size * jnp.sqrt(jnp.asarray(dt, jnp.float32))
         believed = Pose(x=pose.x + drift[0], y=pose.y + drift[1], heading=pose.heading + drift[2])
         return given, believed, FaultMemory(left, frozen, last, drift)

@@ -11,7 +11,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from limsim_jax.maps.scenery import Label
-from limsim_jax.sensors.chance import Purpose, key_of
+from limsim_jax.sensors.chance import Purpose, key_of, whole_steps
 from limsim_jax.sensors.lidar import hits_per_body, scan_around
 from limsim_jax.sensors.rig import LAYERS_16, Lidar
 from limsim_jax.sensors.scene import Bodies, Pose
@@ -58,6 +58,8 @@ class Detector:
       false_range: m, of false tracks.
       false_steps: steps that a false track lasts.
       slots: false tracks at most.
+      latency: s that the list is old; a whole number of steps. `delay_line` and `delayed` of
+        `sensors.chance` hold it back in a policy, and `seen_from` moves it into the frame of now.
 
     Raises:
       ValueError: a value out of range.
@@ -75,6 +77,7 @@ class Detector:
     false_range: float = 40.0
     false_steps: int = 2
     slots: int = 2
+    latency: float = 0.0
 
     def __post_init__(self) -> None:
         for field in fields(self)[2:]:
@@ -92,10 +95,18 @@ class Detector:
                 f"detector: false_tracks: {self.false_tracks}; expected at most {self.slots}, the slots"
             )
 
+    def late(self, dt: float) -> int:
+        """Steps (of `dt` s) that the list is old.
+
+        Raises:
+          ValueError: a latency that is not a whole number of steps.
+        """
+        return whole_steps(self.latency, dt, "detector: latency")
+
     def without_errors(self) -> Detector:
-        """The same detector, exact for what it sees."""
+        """The same detector, exact and at once for what it sees."""
         names = ("position_noise", "position_growth", "heading_noise", "size_noise", "speed_noise")
-        return replace(self, **dict.fromkeys((*names, "misses", "false_tracks"), 0.0), slots=0)
+        return replace(self, **dict.fromkeys((*names, "misses", "false_tracks", "latency"), 0.0), slots=0)
 
 
 @jax.named_scope("object_list")

@@ -211,6 +211,24 @@ def front_cameras(width: int = 64, height: int = 36, lidar: Lidar | None = None)
     return replace(six_cameras(width, height, lidar).only("front_left", "front", "front_right"))
 
 
+def rig_named(name: str) -> Rig:
+    """A rig to watch by: `six`, `front` or `one` cameras with a LiDAR of 16 layers.
+
+    Pictures have 160 x 90, 224 x 126 and 320 x 180 pixels.
+
+    Raises:
+      ValueError: another name.
+    """
+    rigs = {
+        "six": six_cameras(160, 90, LAYERS_16),
+        "front": front_cameras(224, 126, LAYERS_16),
+        "one": six_cameras(320, 180, LAYERS_16).only("front"),
+    }
+    if name not in rigs:
+        raise ValueError(f"rig '{name}'; known are {', '.join(rigs)}")
+    return rigs[name]
+
+
 LAYERS_16 = Lidar()
 """16 layers, 2 degrees apart (Velodyne VLP-16: -15 to 15 degrees, 3 cm), on the roof."""
 

@@ -19,6 +19,7 @@ class Pack:
 
     def __init__(self) -> None:
         self.columns: dict[str, list[int]] = {}  # offset (bytes), numbers, numbers per row, scale
+        self.blocks: dict[str, list[int]] = {}  # offset, bytes
         self.parts: list[bytes] = []
         self.size = 0
 
@@ -31,6 +32,13 @@ class Pack:
         self.columns[name] = [self.size, unsigned.size, whole.shape[-1], scale]
         self.parts.append(unsigned.view(np.uint8).reshape(-1, 4).T.tobytes())
         self.size += len(self.parts[-1])
+
+    def add_bytes(self, name: str, values: NDArray[Any]) -> None:
+        """Add numbers of one byte as they are."""
+        part = np.ascontiguousarray(values, np.uint8).tobytes()
+        self.blocks[name] = [self.size, len(part)]
+        self.parts.append(part)
+        self.size += len(part)
 
     def add_points(self, name: str, xy: NDArray[np.float64], shift: NDArray[np.float64]) -> None:
         """Add points `[K, 2]` (file coordinates) to the centimetre, as `name`_x, `name`_y."""

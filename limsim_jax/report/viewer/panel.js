@@ -180,6 +180,7 @@ function frame(now) {
   if (dirty) {
     dirty = false;
     draw();
+    drawSense();
     inspect();
     const share = last > first ? (t - first) / (last - first) : 1;
     $("done").style.width = $("knob").style.left = `${100 * share}%`;
@@ -303,6 +304,7 @@ $("speed").onchange = event => setSpeed(Number(event.target.value));
 $("closer").onclick = () => zoom(1.5);
 $("farther").onclick = () => zoom(1 / 1.5);
 $("fit").onclick = fit;
+$("sensing").onclick = () => setSensing(!lit);
 $("follow").onclick = () => setFollow(!follow);
 $("drop").onclick = () => select(null);
 // Keys belong to the map again after a click or a choice by mouse: otherwise space would repeat the button.
@@ -323,6 +325,7 @@ addEventListener("keydown", event => {
     Home: () => setTime(first, true), End: () => setTime(last, true), p: () => nextMoment(-1), n: () => nextMoment(1),
     "+": () => zoom(1.5), "=": () => zoom(1.5), "-": () => zoom(1 / 1.5), "0": fit, f: () => setFollow(!follow), Escape: () => select(null),
     "<": () => setSpeed(speed / 2), ">": () => setSpeed(speed * 2), ",": () => setSpeed(speed / 2), ".": () => setSpeed(speed * 2),
+    c: () => { if (sense) setSensing(!lit); },
     e: () => { if (egoStay) { select(egoStay); setFollow(true); } },
   };
   if (keys[event.key]) { event.preventDefault(); keys[event.key](); }
@@ -356,6 +359,7 @@ if (egoStay) {
   $("egosign").hidden = false;
   $("egosign").querySelector("i").style.background = meta.colors.ego;
 }
+$("sensekey").hidden = $("sensetext").hidden = !sense;
 if (meta.plan) {
   $("planned").hidden = false;
   $("planned").querySelector("i").style.borderTop = `2.5px solid ${meta.colors.ego}`;
@@ -428,6 +432,7 @@ function tellAddress() {
   waits = setTimeout(() => { try { history.replaceState(null, "", at); } catch { /* within the frame of a notebook */ } }, 300);
 }
 new ResizeObserver(resize).observe($("stage"));
+new ResizeObserver(() => { dirty = true; }).observe($("sense"));
 prefersDark.addEventListener("change", setPalette);
 setPalette();
 resize();

@@ -330,6 +330,7 @@ function draw() {
   if (there) order.push(sel.slot);
   if (own !== null && !(there && sel.slot === own)) order.push(own);
   order.forEach(slot => drawVehicle(slot, poses[slot]));
+  if (sense && on("objects")) drawObjects();
 
   if (there) {
     const i = sel.slot * T + k, lead = C.lead[i];

@@ -30,10 +30,12 @@ async function unpack() {
     }
     columns[name] = values;
   }
-  return [meta, columns];
+  const blocks = {};
+  for (const [name, [offset, size]] of Object.entries(meta.blocks)) blocks[name] = bytes.subarray(start + offset, start + offset + size);
+  return [meta, columns, blocks];
 }
 
-const [meta, C] = await unpack();
+const [meta, C, B] = await unpack();
 const T = meta.steps, N = meta.slots, times = C.time, first = times[0], last = times[T - 1];
 const net = meta.network;
 
@@ -74,6 +76,7 @@ const layers = {
   path: ["Path of the selected", true], numbers: ["Slot numbers", true],
 };
 if (meta.plan) layers.plan = ["Planned trajectories", true];
+if (meta.sense) layers.objects = ["Object list", true];
 if (meta.interest || C.inside) layers.interest = ["Area of interest", true];
 const on = name => layers[name] !== undefined && layers[name][1];
 let colour = "speed";

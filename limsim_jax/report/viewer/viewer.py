@@ -27,9 +27,11 @@ from limsim_jax.maps.network import Network
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.metrics.moments import RESPONSIBLE, value_text, words
 from limsim_jax.report.frames import COLLIDED, DRIVEN, EGO, SIGNALS
+from limsim_jax.report.strip import FilmLike
 from limsim_jax.report.templates import read, render
 from limsim_jax.report.viewer.pack import Pack, held, origin
 from limsim_jax.report.viewer.roads import add_map
+from limsim_jax.report.viewer.sensed import add_sensed
 from limsim_jax.report.viewer.traffic import add_driven, add_traffic
 from limsim_jax.simulation.ending import ending, shown_steps
 from limsim_jax.simulation.trace import Trace
@@ -66,6 +68,7 @@ def write_viewer(
     interest: ArrayLike | Sequence[tuple[float, ArrayLike]] | None = None,
     title: str = "",
     every: int = 1,
+    sensors: FilmLike | None = None,
 ) -> None:
     """Write a replay of a trace as one HTML file; whole or not at all.
 
@@ -88,6 +91,8 @@ def write_viewer(
         polygons `[K, 2]`, x and y (m) in the coordinates of the lane map, each shown until the next one.
       title: at the top; the name of the map by default.
       every: steps of the trace per step of the replay.
+      sensors: what the ego senses, a `Film`: its pictures, point clouds, bird's-eye views and object lists
+        stand below the map, at each moment the last frame.
 
     Raises:
       ValueError: an unknown suffix, a trace that is empty or does not fit together or to the map, a slot
@@ -142,18 +147,24 @@ def write_viewer(
         pack.add("inside", held(inside[chosen], shown.active).T, 1)
     meta["plan"] = add_driven(pack, lane_map, shown, ego)
     meta["network"] = add_map(pack, network, lane_map, shown.phase)
+    meta["sense"] = None if sensors is None else add_sensed(pack, lane_map, sensors)
     _write(path, meta, pack)
 
 
 def _write(path: Path, meta: dict[str, Any], pack: Pack) -> None:
-    head = json.dumps(meta | {"columns": pack.columns}, separators=(",", ":"), allow_nan=False).encode()
+    head = json.dumps(
+        meta | {"columns": pack.columns, "blocks": pack.blocks}, separators=(",", ":"), allow_nan=False
+    ).encode()
     block = zlib.compress(len(head).to_bytes(4, "little") + head + b"".join(pack.parts), 6)
     page = render(
         "viewer/viewer.html.j2",
         title=meta["title"],
         data=base64.b64encode(block).decode(),
         style=read("viewer/viewer.css"),
-        script=read("viewer/viewer.js") + read("viewer/scene.js") + read("viewer/panel.js"),
+        script=read("viewer/viewer.js")
+        + read("viewer/scene.js")
+        + read("viewer/sense.js")
+        + read("viewer/panel.js"),
     )
     write_whole(path, page)
 
