@@ -85,7 +85,7 @@ def sweep(
     ] = None,
     engine: Annotated[
         Literal["limsim", "sumo"],
-        typer.Option(help="Who runs the traffic: limsim, or SUMO itself (a .sumocfg; extra 'sumo')."),
+        typer.Option(help="What runs the traffic: limsim, or SUMO itself (a .sumocfg; extra 'sumo')."),
     ] = "limsim",
     ego: Annotated[
         str | None,
@@ -99,7 +99,7 @@ def sweep(
     ] = None,
     drivers: Annotated[
         Literal["sumo", "ours"] | None,
-        typer.Option(help="With SUMO: who drives the other vehicles.  [default: sumo]"),
+        typer.Option(help="With SUMO: what drives the other vehicles.  [default: sumo]"),
     ] = None,
     on_error: Annotated[
         Literal["record", "stop"],

@@ -295,7 +295,10 @@ def test_a_demand_that_does_not_fit_is_told():
 
 def test_the_table_says_what_a_policy_knows():
     worlds = {("ramp", name): {"mean_speed": [9.0, 8.0]} for name in ("a", "b", "c", "d")}
-    told = {("ramp", name): {"knows": what} for name, what in zip("abc", ("state", "view", "sensors"), strict=True)}
+    told = {
+        ("ramp", name): {"knows": what}
+        for name, what in zip("abc", ("state", "view", "sensors"), strict=True)
+    }
     found = headline(made(worlds, provenance=told))
     assert found.rows[1] == ["knows of other vehicles", "all", "what it sees", "what its sensors give", ""]
     assert headline(made(worlds)).rows[1][0] != "knows of other vehicles"
