@@ -85,9 +85,12 @@ class Map:
     @cached_property
     def scenery(self) -> Scenery:
         """What sensors see of the map: painted ground and lights."""
+        import jax
+
         from limsim_jax.maps.scenery import build_scenery
 
-        return build_scenery(self.network, self.lanes)
+        with jax.ensure_compile_time_eval():  # the first to ask may be a function that is being traced
+            return build_scenery(self.network, self.lanes)
 
     @cached_property
     def lane_ids(self) -> list[str]:

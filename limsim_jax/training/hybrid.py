@@ -1,4 +1,4 @@
-"""Training of learned policies on our own rollouts."""
+"""Training of PDM-Hybrid on our own rollouts."""
 
 from __future__ import annotations
 
