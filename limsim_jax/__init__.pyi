@@ -53,6 +53,10 @@ from .policies.view import View as View
 from .rare_events.estimate import RareEvent as RareEvent
 from .rare_events.estimate import rare_event as rare_event
 from .report import plots as plots
+from .scenarios.instructions.intent import InstructionError as InstructionError
+from .scenarios.instructions.intent import Intent as Intent
+from .scenarios.instructions.model import LanguageModel as LanguageModel
+from .scenarios.instructions.scenario import scenario as scenario
 from .scenarios.openscenario.scenario import openscenario as openscenario
 from .scenarios.openscenario.source import OpenScenarioError as OpenScenarioError
 from .sensors.faults import Faults as Faults

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from limsim_jax import __version__
-from limsim_jax.cli import fitting, results, scenarios
+from limsim_jax.cli import fitting, instructions, results, scenarios
 from limsim_jax.cli.bench import bench_app
 from limsim_jax.cli.maps import map_app
 from limsim_jax.cli.run import run
@@ -35,6 +35,7 @@ app.command()(run)
 results.add_commands(app)
 fitting.add_commands(app)
 scenarios.add_commands(app)
+instructions.add_commands(app)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

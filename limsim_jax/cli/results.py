@@ -94,6 +94,9 @@ def sweep(
             help="With SUMO: vehicles that the policy drives.  [default: drawn by the seed]",
         ),
     ] = None,
+    egos: Annotated[
+        int | None, typer.Option(min=1, help="With SUMO: how many vehicles are drawn.  [default: 1]")
+    ] = None,
     horizon: Annotated[
         float | None, typer.Option(help="With SUMO: s that an ego has for its trip.  [default: 180]")
     ] = None,
@@ -124,7 +127,9 @@ def sweep(
         raise typer.BadParameter(f"{workers}; at least 1", param_hint="--workers")
     if fresh and part is not None:
         raise typer.BadParameter("it would remove the results of other shards", param_hint="--fresh")
-    in_sumo = {"--ego": ego, "--horizon": horizon, "--drivers": drivers}
+    in_sumo = {"--ego": ego, "--egos": egos, "--horizon": horizon, "--drivers": drivers}
+    if ego is not None and egos is not None:
+        raise typer.BadParameter("--ego names them; --egos draws so many", param_hint="--egos")
     if engine == "sumo":
         _not_with_sumo({"--map": map_file, "--workers": workers})
         experiments: list[ExperimentFile] = []
@@ -142,7 +147,7 @@ def sweep(
 
     kept: dict[tuple[str, str], int] = {}
     if engine == "sumo":
-        made = [_sumo_episodes(experiment, policy, ego, horizon, drivers, chunk)]
+        made = [_sumo_episodes(experiment, policy, ego, egos, horizon, drivers, chunk)]
     else:
         made = build(experiments, chunk) if workers is None else []
     try:
@@ -457,6 +462,7 @@ def _sumo_episodes(
     config: str,
     policy: str | None,
     ego: str | None,
+    egos: int | None,
     horizon: float | None,
     drivers: Literal["sumo", "ours"] | None,
     chunk: int | None,
@@ -468,6 +474,7 @@ def _sumo_episodes(
         config,
         policy="limsim_tm" if policy is None else policy,
         ego=None if ego is None else ego.split(","),
+        egos=1 if egos is None else egos,
         horizon=HORIZON if horizon is None else horizon,
         drivers="sumo" if drivers is None else drivers,
         chunk=chunk,

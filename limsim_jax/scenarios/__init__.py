@@ -1,1 +1,1 @@
-"""Scenarios of other tools as worlds of ours."""
+"""Scenarios of other tools, and from instructions, as worlds of ours."""

@@ -25,6 +25,9 @@ from limsim_jax.types import Actions, Order, Progress, Script, Zones
 _NEVER_CHANGES = 1e9
 """m/s^2, `Driver.threshold` of a vehicle that keeps its lane."""
 
+_ACTIONS, _ZONES = 8, 2
+"""Numbers of actions and zones are rounded up to multiples of these, so that scripts share programs."""
+
 
 # ---- zones
 
@@ -215,19 +218,23 @@ def _actions(experiment: ExperimentFile, first: int) -> Actions | None:
         "travelled": [x.travelled for x in tables],
         "after": [x.after for x in tables],
     }
-    return Actions(
-        slot=jnp.asarray([slot for slot, _ in actions], jnp.int32),
-        order=jnp.asarray([int(_order(x)) for x in tables], jnp.int32),
-        careful=jnp.asarray([x.careful for x in tables], bool),
-        before=jnp.asarray(before, jnp.int32),
-        **{name: jnp.asarray(x, jnp.float32) for name, x in floats.items()},
-    )
+    columns = {name: np.asarray(x, np.float32) for name, x in floats.items()} | {
+        "slot": np.asarray([slot for slot, _ in actions], np.int32),
+        "order": np.asarray([int(_order(x)) for x in tables], np.int32),
+        "careful": np.asarray([x.careful for x in tables], bool),
+        "before": np.asarray(before, np.int32),
+    }
+    spare = -len(actions) % _ACTIONS  # these never begin
+    columns = {name: np.pad(x, (0, spare), mode="edge") for name, x in columns.items()}
+    columns["at"][len(actions) :] = np.inf
+    return Actions(**{name: jnp.asarray(x) for name, x in columns.items()})
 
 
 def share_done(actions: Actions, progress: Progress) -> NDArray[np.float64]:
     """Share of the actions that have begun, `[W]`; a lane change once it has started."""
+    known = np.isfinite(np.asarray(actions.at))
     waits = (np.asarray(actions.order) == Order.CHANGE_LANE) & ~np.asarray(progress.made)
-    return (np.isfinite(np.asarray(progress.begun)) & ~waits).mean(-1)
+    return (np.isfinite(np.asarray(progress.begun)) & ~waits)[..., known].mean(-1)
 
 
 def _stands(obstacle: ObstacleTable) -> list[ActionTable]:
@@ -256,8 +263,9 @@ def _zones(experiment: ExperimentFile, original: Network, town: Map) -> Zones | 
     if not zones:
         return None
     rows = {name: row for row, name in enumerate(town.lane_ids)}
-    lanes = np.zeros((len(zones), town.lanes.length.shape[0]), bool)
-    for mask, (k, zone) in zip(lanes, zones, strict=True):
+    spare = -len(zones) % _ZONES
+    lanes = np.zeros((len(zones) + spare, town.lanes.length.shape[0]), bool)  # no lane is in a spare one
+    for mask, (k, zone) in zip(lanes, zones, strict=False):
         found = zone_lanes(_field(experiment, k), zone, original, town.network)
         mask[[rows[lane.id] for lane in found if lane.id in rows]] = True
     table = {
@@ -266,4 +274,5 @@ def _zones(experiment: ExperimentFile, original: Network, town: Map) -> Zones | 
         "limit": [math.inf if zone.speed_limit is None else zone.speed_limit for _, zone in zones],
         "friction": [math.inf if zone.friction is None else zone.friction for _, zone in zones],
     }
-    return Zones(lanes=jnp.asarray(lanes), **{name: jnp.asarray(x, jnp.float32) for name, x in table.items()})
+    ends = {name: np.pad(np.asarray(x, np.float32), (0, spare), mode="edge") for name, x in table.items()}
+    return Zones(lanes=jnp.asarray(lanes), **{name: jnp.asarray(x) for name, x in ends.items()})

@@ -269,6 +269,19 @@ def test_a_turn_off_the_first_route_keeps_the_vehicle_and_its_lanes(nets: Path, 
         assert inside and (set(inside) <= set(left)) == told, (inside, left)
 
 
+def test_a_route_that_sumo_refuses_leaves_the_vehicle_where_it_is_put(nets: Path) -> None:
+    """Edges without a connection; SUMO also refuses some routes close to the end of an edge."""
+    text = CAR + EAST + '<vehicle id="ego" type="car" route="east" depart="0" departPos="120"/>'
+    with SumoProcess(demand(nets, text)) as process:
+        ego, reading = until(process, "ego")
+        k = at(reading, ego)
+        x, y, angle = (float(v[k]) for v in (reading.x, reading.y, reading.angle))
+        for step in range(1, 4):
+            move = Move(x + step, y, angle, 10.0, edges=("A1B1", "C2C1"))
+            reading = process.step(Orders(take=(ego,) if step == 1 else (), move={ego: move}))
+            assert float(reading.x[at(reading, ego)]) == pytest.approx(x + step, abs=0.01)
+
+
 def test_a_thousand_ids_come_go_and_come_again(nets: Path) -> None:
     with SumoProcess(demand(nets, CAR)) as process:
         seen, there = 0, []

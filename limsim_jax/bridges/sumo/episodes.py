@@ -289,9 +289,9 @@ class SumoEpisodes:
         for step in range(steps + 1):
             now = _stacked(seen, pad)
             lanes, began = self._lanes(), time.perf_counter()
-            carry, trace, pushed = tick(lanes, carry, now, np.bool_(step == 0), keys)
-            pushed = jax.device_get(pushed)
             due = step % self.experiment.decision_every == 0
+            carry, trace, pushed = tick(lanes, carry, now, np.bool_(step == 0), np.bool_(due), keys)
+            pushed = jax.device_get(pushed)
             if step:  # the first may compile
                 self.seconds["decide" if due else "drive"].append((time.perf_counter() - began) / self.chunk)
             if step and keep:
@@ -311,7 +311,7 @@ class SumoEpisodes:
         program, once = self.program, run_once()
         return (
             jax.jit(jax.vmap(program.start, (None, 0)), compiler_options=once),
-            jax.jit(jax.vmap(program.tick, (None, 0, 0, None, 0)), compiler_options=run_often()),
+            jax.jit(jax.vmap(program.tick, (None, 0, 0, None, None, 0)), compiler_options=run_often()),
             jax.jit(jax.vmap(program.result, (None, 0)), compiler_options=once),
         )
 

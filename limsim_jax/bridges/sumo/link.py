@@ -6,6 +6,7 @@ runs each in a process of its own. Facts about `moveToXY` and modes are measured
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import math
 from typing import Any
@@ -183,13 +184,15 @@ class Link:
     def _reroute(self, name: str, edges: tuple[str, ...]) -> None:
         """Give a vehicle our route, from its present edge on.
 
-        Within a junction SUMO takes no new route; on the edge before it needs the right one."""
+        Within a junction SUMO takes no new route; on the edge before it needs the right one. Close to the
+        end of an edge SUMO may refuse one; it gets it again in the next step."""
         vehicle = self.sumo.vehicle
         here = vehicle.getRoadID(name)
         if here in edges:
             wanted = edges[edges.index(here) :]
             if tuple(vehicle.getRoute(name))[vehicle.getRouteIndex(name) :] != wanted:
-                vehicle.setRoute(name, list(wanted))
+                with contextlib.suppress(self.sumo.TraCIException):
+                    vehicle.setRoute(name, list(wanted))
 
     # --- ghosts
 

@@ -172,7 +172,13 @@ class SharedWorld:
         return SharedCarry(state, moved, memory, no_totals(state), stood, measured)
 
     def tick(
-        self, lane_map: LaneMap, carry: SharedCarry, seen: Seen, first: Bool[Array, ""], key: Key[Array, ""]
+        self,
+        lane_map: LaneMap,
+        carry: SharedCarry,
+        seen: Seen,
+        first: Bool[Array, ""],
+        due: Bool[Array, ""],
+        key: Key[Array, ""],
     ) -> tuple[SharedCarry, Trace, Pushed]:
         """Settle at this moment, and drive to the next.
 
@@ -181,6 +187,7 @@ class SharedWorld:
           carry: of the tick before.
           seen: what SUMO says now.
           first: nothing has moved yet: there is nothing to settle.
+          due: the policy decides now. The same for all worlds of a batch, so that it is not asked otherwise.
           key: of the world.
 
         Returns:
@@ -201,7 +208,6 @@ class SharedWorld:
         seen_now = trace(lanes)(tick)
 
         state = settled.state
-        due = state.step % self.decision_every == 0
         now = jax.random.fold_in(key, state.step)
         moved, memory = self._move(lanes, state, carry.memory, moved.command, due, now)
         after = settled._replace(moved=moved, memory=memory)

@@ -1,0 +1,1 @@
+"""Scenarios from a sentence: understood, placed on a map, tried, repaired or refused."""
