@@ -26,6 +26,12 @@ def scenario(
     seeds: Annotated[
         int, typer.Option(min=0, help="Worlds in which it is tried; 0: it is written without a trial.")
     ] = 10,
+    severe: Annotated[
+        bool,
+        typer.Option(
+            "--severity", help="Try it with other distances, and write the hardest without contacts."
+        ),
+    ] = False,
     server: Annotated[
         str | None,
         typer.Option(
@@ -47,7 +53,7 @@ def scenario(
     from limsim_jax.scenarios.instructions.intent import InstructionError
     from limsim_jax.scenarios.instructions.model import LanguageModel
     from limsim_jax.scenarios.instructions.scenario import scenario as make
-    from limsim_jax.scenarios.instructions.scenario import slug
+    from limsim_jax.scenarios.instructions.scenario import severity, slug
 
     path = Path(f"{slug(text)}.toml") if out is None else out
     if path.exists():
@@ -59,6 +65,15 @@ def scenario(
         text, map=map_file, folder=path.parent, seeds=seeds, understand=understand,
         tell=lambda line: print(line, flush=True),
     )  # fmt: skip
+    if severe:
+        if not seeds:
+            raise typer.BadParameter("it is tried; leave --seeds 0 out", param_hint="--severity")
+        rows = severity(found, seeds)
+        for factor, one in rows:
+            assert one.trial is not None
+            shown, contact = one.trial.all_shown, one.trial.contact
+            print(f"distances x {factor:<5g} shown in {shown:4.0%}, contacts in {contact:4.0%} of the worlds")
+        found = next((x for _, x in reversed(rows) if x.trial is not None and x.trial.good), found)
     found.save(path)
     print(found.description)
     print(f"wrote {path}; run it: limsim-jax sweep {path} --policy pdm_closed")

@@ -311,6 +311,24 @@ def test_a_placement_that_fails_is_changed_and_then_refused(monkeypatch, tmp_pat
         making.scenario("A car cuts in on a motorway", folder=tmp_path)
 
 
+def test_severity_scales_distances_until_there_are_contacts(monkeypatch, tmp_path):
+    def run(file, intent, placed, seeds):
+        near = placed.vehicles[0]["s"] - placed.ego["s"] - 5.0
+        return making.Trial((1.0,), 1.0, float(near < 20.0), (5.0,))
+
+    monkeypatch.setattr(making, "try_out", run)
+    text = "A car brakes hard 40 m ahead of the ego on a motorway"
+    rows = making.severity(making.scenario(text, folder=tmp_path), seeds=3)
+    gaps = [one.experiment.vehicle[0].s - one.experiment.ego[0].s - 5.0 for _, one in rows]
+    assert gaps == pytest.approx([40.0 * factor for factor, _ in rows], abs=0.02)
+    assert [one.trial and one.trial.contact for _, one in rows] == [float(gap < 20.0) for gap in gaps]
+    crossing = making.scenario(
+        "A car comes from the right at an intersection without lights", folder=tmp_path
+    )
+    with pytest.raises(InstructionError, match="nothing in it has a distance"):
+        making.severity(crossing)
+
+
 def test_the_command_writes_a_file_and_says_what_is_wrong_in_a_line(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["scenario", "A car brakes hard on a two-lane motorway", "--seeds", "0"]) in (0, None)

@@ -250,7 +250,8 @@ def _at_merge(intent: Intent, spot: Merge, tuning: Tuning) -> Placed:
         line, at, usual = (spot.ramp, spot.ramp_at, slower) if merging else (spot.main, spot.main_at, v)
         speed = speed_of(actor, v) if actor.speed or actor.faster else usual
         gap = next((act.gap for act in actor.acts if act.gap is not None), actor.gap)
-        apart = middle(gap, MERGES) * tuning.nearer + LENGTHS[actor.kind]
+        near = tuning.nearer if gap is None else 1.0
+        apart = middle(gap, MERGES) * near * tuning.severe + LENGTHS[actor.kind]
         front = at - speed * time + (-apart if actor.place == "behind" else apart) + speed * tuning.earlier
         side = SIDES[actor.lane]
         side = 0 if merging or line.at(front, side) is None else side

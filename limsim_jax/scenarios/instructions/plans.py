@@ -61,13 +61,15 @@ class Tuning:
 
     Attributes:
       earlier: s by which other vehicles are ahead of their time at a junction or ramp.
-      nearer: factor on distances to the ego.
+      nearer: factor on distances to the ego that the instruction does not say.
+      severe: factor on all distances to the ego.
       later: s by which the first act is delayed.
       which: number of the place among those that fit.
     """
 
     earlier: float = 0.0
     nearer: float = 1.0
+    severe: float = 1.0
     later: float = 0.0
     which: int = 0
 
@@ -133,11 +135,15 @@ class _Case:
     def ahead(self, otherwise: float) -> float:
         """m to the front of a vehicle ahead of the ego."""
         asked = self.gap if self.act.gap is None else middle(self.act.gap, 0.0)
-        return (otherwise * self.tuning.nearer if asked is None else asked) + self.length
+        return self.scaled(otherwise, asked) + self.length
 
     def behind(self, otherwise: float) -> float:
         """m to the front of a vehicle that starts behind the ego: negative."""
-        return -(otherwise * self.tuning.nearer if self.gap is None else self.gap) - EGO
+        return -self.scaled(otherwise, self.gap) - EGO
+
+    def scaled(self, otherwise: float, asked: float | None) -> float:
+        """m that the instruction says, or that are usual, after repairs."""
+        return self.tuning.severe * (otherwise * self.tuning.nearer if asked is None else asked)
 
     def plan(self, front: float, side: int, **more: Any) -> Plan:
         return Plan(**({"front": front, "side": side, "v": self.v, "length": self.length} | more))
@@ -154,7 +160,8 @@ def _stand(case: _Case) -> Plan:
 
 def _cut_in(case: _Case) -> Plan:
     """Into the ego's lane ahead of it: from ahead if it is slower, from behind if it is faster."""
-    near = middle(case.act.gap, CUT_IN) * case.tuning.nearer
+    asked = None if case.act.gap is None else middle(case.act.gap, CUT_IN)
+    near = case.scaled(CUT_IN, asked)
     side = SIDES[case.actor.lane] or SIDES[case.act.side] or 1
     faster = case.v - case.ego
     move: dict[str, Any] = {"change_lane": _TURNS[-side], "duration": CHANGE}

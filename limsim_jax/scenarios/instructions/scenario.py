@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,11 @@ REFERENCE = "like_traffic"
 KEEPS_LANE = {"speed_factor": 1.0, "threshold": 1000.0, "keep_right": 0.0}
 """Parameters of the ego's driver: it drives at the limit and changes lanes only where its route needs it."""
 
-SLOTS = 64
+FACTORS = (2.0, 1.5, 1.0, 0.75, 0.5, 0.35, 0.25, 0.15)
+"""On distances to the ego, from harmless to hard."""
+
+SLOTS = 32
+"""Vehicles at once, doubled until those at the start fit in twice."""
 
 MAPS: dict[RoadKind, tuple[str, ...]] = {
     "motorway": ("highway", "ramp", "long_route"),
@@ -86,6 +90,7 @@ class Scenario:
       experiment: as a file has it.
       trial: what happened where it was tried; None: it was not.
       tries: how many placements were tried.
+      tuning: what was changed in the last one.
     """
 
     text: str
@@ -93,6 +98,7 @@ class Scenario:
     experiment: ExperimentFile
     trial: Trial | None = None
     tries: int = 1
+    tuning: Tuning = NO_TUNING
 
     def save(self, path: str | Path) -> Path:
         """Write the experiment as .toml."""
@@ -165,14 +171,42 @@ def scenario(
             worst.append(str(error).partition(": ")[2])
             continue
         if found.good:
-            return Scenario(said, intent, file, found, number + 1)
+            return Scenario(said, intent, file, found, number + 1, tuning)
         worst.append(_why(intent, found))
     raise InstructionError(f"it does not come out, after {len(TRIES)} placements: {worst[0]}")
 
 
+def severity(made: Scenario, seeds: int = SEEDS) -> list[tuple[float, Scenario]]:
+    """The same scenario with all distances to the ego scaled by `FACTORS`, each tried.
+
+    It finds out from where on the reference driver has contacts; it gives no probability.
+
+    Args:
+      made: of `scenario`.
+      seeds: worlds of each.
+
+    Raises:
+      InstructionError: nothing in it has a distance to the ego; one line.
+    """
+    town, found, seen = load_map(made.experiment.map), [], set[str]()
+    for factor in FACTORS:
+        tuning = replace(made.tuning, severe=factor)
+        try:
+            placed = place(made.intent, [town], tuning)
+            file = _file(made.text, made.intent, placed)
+            seen.add(str(file.vehicle) + str(file.obstacle))
+            trial = try_out(file, made.intent, placed, seeds)
+        except (InstructionError, ExperimentError):
+            continue  # bodies overlap, or nothing stands far enough away
+        found.append((factor, replace(made, experiment=file, trial=trial, tuning=tuning)))
+    if len(seen) < 2:
+        raise InstructionError("nothing in it has a distance to the ego that could be less")
+    return found
+
+
 def try_out(file: ExperimentFile, intent: Intent, placed: Placed, seeds: int) -> Trial:
     """Run a scenario with `seeds` seeds and look for its events."""
-    episodes = Episodes(file, chunk=seeds)
+    episodes = Episodes(_as_others(file), chunk=seeds)
     replays = episodes.replays([(seed, 0) for seed in range(seeds)], explain=False)
     events, rows = intent.events, []
     for replay in replays:
@@ -189,6 +223,25 @@ def try_out(file: ExperimentFile, intent: Intent, placed: Placed, seeds: int) ->
     )  # fmt: skip
 
 
+def _as_others(file: ExperimentFile) -> ExperimentFile:
+    """The same experiment with a script of everything, so that all scenarios share programs."""
+    table = file.model_dump()
+    if not file.zone:
+        table["zone"] = [{"friction": 2.0}]  # more than any driver asks for
+    if not any(x.action for x in file.vehicle) and not file.obstacle and file.vehicle:
+        table["vehicle"][0]["action"] = [{"at": 2 * file.horizon, "leave": True}]
+    return ExperimentFile.model_validate(table)
+
+
+def _slots(town: Map, density: float, named: int) -> int:
+    """Slots of a world."""
+    km = sum(lane.length for lane in town.network.drivable_lanes()) / 1000
+    need, slots = 2 * (density * km + named + 1), SLOTS
+    while slots < need:
+        slots *= 2
+    return slots
+
+
 def _why(intent: Intent, found: Trial) -> str:
     events = [act.kind.replace("_", " ") for _, act in intent.events]
     missing = [f"'{name}' in {x:.0%} of the worlds" for name, x in zip(events, found.shown, strict=True)]
@@ -203,7 +256,8 @@ def _maps(intent: Intent, given: str | Path | Map | None, folder: Path) -> list[
         return [load_map(given)]
     maps = [load_map(name) for name in MAPS[kind]]
     if kind in ("motorway", "rural", "town") and not _fits(intent, maps):
-        maps = [load_map(write_straight(folder, kind, intent.lanes or (2 if kind == "motorway" else 1)))]
+        lanes = intent.lanes or (2 if kind == "motorway" else 1)
+        maps = [load_map(write_straight(folder, kind, lanes))]
     return maps
 
 
@@ -226,11 +280,14 @@ def _file(text: str, intent: Intent, placed: Placed) -> ExperimentFile:
         zones.append({"speed_limit": round(limit, 2)})
     if intent.friction is not None:
         zones.append({"friction": intent.friction})
+    density = DENSITY[intent.traffic or "none"]
+    named = len(placed.vehicles) + len(placed.obstacles)
     return ExperimentFile.model_validate(
         {
             "name": slug(text), "map": _name_of(placed.map), "description": text.strip(),
-            "horizon": AT_LIGHTS if placed.signalled else HORIZON, "slots": SLOTS,
-            "traffic": {"density": DENSITY[intent.traffic or "none"]}, "zone": zones,
+            "horizon": AT_LIGHTS if placed.signalled else HORIZON,
+            "slots": _slots(placed.map, density, named),
+            "traffic": {"density": density}, "zone": zones,
             "ego": placed.ego | {"policy": REFERENCE, "driver": KEEPS_LANE},
             "vehicle": placed.vehicles, "obstacle": placed.obstacles,
         }
