@@ -10,6 +10,7 @@ from .api.experiment import Zone as Zone
 from .api.experiment import load_experiments as load_experiments
 from .api.map import Map as Map
 from .api.map import load_map as load_map
+from .api.perception import Perception as Perception
 from .api.results import Results as Results
 from .api.results import open_results as open_results
 from .api.sensed import Film as Film

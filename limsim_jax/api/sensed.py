@@ -20,7 +20,7 @@ from limsim_jax.policies.base import sensors_of
 from limsim_jax.sensors.bev import Raster, birds_eye
 from limsim_jax.sensors.camera import Pictures, take_pictures
 from limsim_jax.sensors.faults import Faults
-from limsim_jax.sensors.lidar import Scan, scan_around
+from limsim_jax.sensors.lidar import Scan, hits_per_body, scan_around
 from limsim_jax.sensors.objects import Detector, Objects, detect, seen_from
 from limsim_jax.sensors.rig import LAYERS_16, Rig, rig_named, six_cameras
 from limsim_jax.sensors.scene import Bodies, Pose, Scene, bodies_around, pose_of, scene_of_trace
@@ -101,6 +101,7 @@ class Film:
       bev: the bird's-eye view, `[F, 6, H, W]`, see `sensors.bev.CHANNELS`.
       objects: its object list, `[F, D]`. `objects.pose` is where the vehicle believes to be.
       truth: the bodies that are there, `[F, K]`.
+      hits: rays of the LiDAR of the detector, without errors, that meet each body, `[F, K]`.
       pose: where the vehicle is, `[F]`.
       raster: extent of `bev`.
       size: length and width of the vehicle, m.
@@ -115,6 +116,7 @@ class Film:
     bev: NDArray[Any]
     objects: Objects
     truth: Bodies
+    hits: NDArray[Any]
     pose: Pose
     raster: Raster
     size: tuple[float, float]
@@ -169,7 +171,7 @@ class Film:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All arrays by name, such as `pictures_depth` and `objects_x`; frames are the first axis."""
-        found: dict[str, Any] = {"time": self.time, "step": self.step, "bev": self.bev}
+        found: dict[str, Any] = {"time": self.time, "step": self.step, "bev": self.bev, "hits": self.hits}
         groups = {"pictures": self.pictures, "scan": self.scan}
         for group, of in groups.items():
             if of is not None:
@@ -309,7 +311,7 @@ def _shots(
     for step in steps.tolist():
         was = max(step - late, first)
         past = _scene(world, scenery, was) if late else None
-        pictures, scan, bev, objects, bodies, pose = _look(
+        pictures, scan, bev, objects, bodies, hits, pose = _look(
             rig, detector, raster, scenery, _scene(world, scenery, step), past, slot, key, (step, was)
         )
         if faults is not None:
@@ -320,13 +322,13 @@ def _shots(
             )
             pictures, objects = None if pictures is None else shown, replace(objects, pose=believed)
             before = float(time[step])
-        seen.append(jax.tree.map(np.asarray, (pictures, scan, bev, objects, bodies, pose)))
+        seen.append(jax.tree.map(np.asarray, (pictures, scan, bev, objects, bodies, hits, pose)))
     stacked = jax.tree.map(lambda *x: np.stack(x), *seen)
     length, width = (float(x) for x in world.trace.box[steps[0], slot, 3:])
-    pictures, scan, bev, objects, bodies, pose = stacked
+    pictures, scan, bev, objects, bodies, hits, pose = stacked
     return Film(
         time=time[steps], step=steps, rig=rig, pictures=pictures, scan=scan, bev=bev, objects=objects,
-        truth=bodies, pose=pose, raster=raster, size=(length, width), title=world.title,
+        truth=bodies, hits=hits, pose=pose, raster=raster, size=(length, width), title=world.title,
     )  # fmt: skip
 
 
@@ -361,7 +363,8 @@ def _look(
         objects = detect(detector, pose, bodies, key, was)
     else:
         objects = seen_from(detect(detector, pose_of(past, slot), around(past), key, was), pose)
-    return pictures, scan, birds_eye(raster, scenery, pose, bodies), objects, bodies, pose
+    hits = hits_per_body(scan_around(detector.lidar, bodies), bodies)
+    return pictures, scan, birds_eye(raster, scenery, pose, bodies), objects, bodies, hits, pose
 
 
 @partial(jax.jit, static_argnums=(0,))

@@ -17,6 +17,7 @@ from limsim_jax.simulation.trace import Trace
 
 if TYPE_CHECKING:
     from limsim_jax.api.futures import Futures
+    from limsim_jax.api.perception import Perception
     from limsim_jax.api.sensed import Film, Sensed
     from limsim_jax.policies.base import PolicyLike
     from limsim_jax.sensors.rig import Rig
@@ -168,6 +169,20 @@ class World:
         from limsim_jax.api.sensed import film
 
         return film(self, rig, **options)
+
+    def perception(self, **options: Any) -> Perception:
+        """How well the ego perceives other vehicles: detection, tracking, prediction against the truth.
+
+        Args:
+          options: `detector` (how object lists come about), `faults`, `slot` of another vehicle, `every` (s
+            between looks; a decision unless told), `reach` (m around the ego, 50).
+
+        Raises:
+          ValueError: no frame with that vehicle, or a number out of range.
+        """
+        from limsim_jax.api.perception import perception
+
+        return perception(self, **options)
 
     def _watched(self, sensors: Film | Rig | str) -> Film:
         """A film of few frames, to be shown beside the traffic."""

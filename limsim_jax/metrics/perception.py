@@ -82,7 +82,11 @@ def within(boxes: Boxes, reach: float) -> Boxes:
 
 
 def average_precision(
-    found: Boxes, truth: Boxes, *, distance: float | None = None, iou: float | None = None
+    found: Boxes,
+    truth: Boxes,
+    *,
+    distance: float | Float[Array, ""] | None = None,
+    iou: float | Float[Array, ""] | None = None,
 ) -> Float[Array, ""]:
     """Average precision of an episode, by nuScenes' rules.
 
@@ -104,7 +108,8 @@ def average_precision(
 
     def look(found: Boxes, truth: Boxes) -> Bool[Array, " D"]:
         if iou is None:
-            return right_detections(found, truth, distances(found, truth), distance or 0.0)
+            assert distance is not None
+            return right_detections(found, truth, distances(found, truth), distance)
         return right_detections(found, truth, -overlaps(found, truth), -iou)
 
     right = jax.vmap(look)(found, truth).reshape(-1)
@@ -121,7 +126,9 @@ def average_precision(
     return jnp.where(bodies > 0, jnp.where(hits[-1] > 0, score, 0.0), jnp.nan)
 
 
-def right_detections(found: Boxes, truth: Boxes, cost: Float[Array, "D K"], most: float) -> Bool[Array, " D"]:
+def right_detections(
+    found: Boxes, truth: Boxes, cost: Float[Array, "D K"], most: float | Array
+) -> Bool[Array, " D"]:
     """Detections of a look that match a body, by falling score."""
 
     def match(free: Array, k: Array) -> tuple[Array, Array]:

@@ -246,9 +246,10 @@ def with_scenery(policy: Any, town: Map, lane_map: LaneMap | None = None) -> Lan
 def sensors_of(policy: Any) -> Rig | None:
     """The rig that a policy declares as `sensors` or `rig`.
 
-    It may be that of a policy within it. None: there is none."""
+    `sensors` may also be an object with a `rig`, and the policy one within another. None: there is none."""
     for name in ("sensors", "rig"):
-        if isinstance(found := getattr(policy, name, None), Rig):
+        found = getattr(policy, name, None)
+        if isinstance(found := getattr(found, "rig", found), Rig):
             return found
     for one in _inner(policy):
         if (found := sensors_of(one)) is not None:
@@ -361,9 +362,16 @@ def variants(policy: Any, seen: Predictor) -> dict[str, PolicyLike]:
 
     After a failure each is asked for: a module is to blame if its reference would have avoided the failure. A
     policy made of modules has a method `variants`; of others there are none. `seen` predicts what happened.
+    A view that errs is a module, too: `perception`, whose reference sees the same without errors. References
+    of other modules see with its errors.
     """
-    found = getattr(policy, "variants", None)
-    return {} if found is None else found(seen)
+    own = getattr(policy, "variants", None)
+    found = {} if own is None else own(seen)
+    view = getattr(policy, "view", None)
+    if getattr(policy, "privileged", False) or not isinstance(view, View) or view == view.without_errors():
+        return found
+    found = {name: seeing(other, view=view, privileged=False) for name, other in found.items()}
+    return {"perception": seeing(policy, view=view.without_errors())} | found
 
 
 def memory_rows(policy: Any, memory: Any) -> Any:

@@ -150,7 +150,8 @@ def test_the_rig_of_a_policy_is_found_wherever_it_is():
     class Sees(LikeTraffic):
         sensors = RIG
 
-    for policy in (Sees(), Wrapper(Wrapper(Sees())), SimpleNamespace(rig=RIG)):
+    with_object = SimpleNamespace(sensors=SimpleNamespace(rig=RIG), rig=None)
+    for policy in (Sees(), Wrapper(Wrapper(Sees())), SimpleNamespace(rig=RIG), with_object):
         assert sensors_of(policy) is RIG
     for policy in (LikeTraffic(), Wrapper(LikeTraffic()), None, SimpleNamespace(sensors=3)):
         assert sensors_of(policy) is None

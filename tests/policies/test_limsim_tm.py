@@ -13,14 +13,15 @@ from limsim_jax.maps.lane_map import NO_LANE, lane_rows
 from limsim_jax.maps.origins import origins
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.policies.area import AreaOfInterest
-from limsim_jax.policies.base import LikeTraffic, variants
+from limsim_jax.policies.base import LikeTraffic, Policy, variants
 from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.limsim_tm.decide import corridor, grouped
 from limsim_jax.policies.limsim_tm.plan import room_needed
 from limsim_jax.policies.limsim_tm.search import Settings
 from limsim_jax.policies.pdm import PDMClosed
 from limsim_jax.policies.predict import along_route, constant_velocity
-from limsim_jax.policies.simple import FollowLane
+from limsim_jax.policies.simple import ConstantSpeed, FollowLane
+from limsim_jax.policies.view import View
 from limsim_jax.simulation.rollout import Rollout, one_world
 from limsim_jax.simulation.trace import trace
 from limsim_jax.traffic.demand import EgoStart, Flow, build_demand, sample_scenario
@@ -176,3 +177,22 @@ def test_each_module_has_a_reference():
     assert mine.ego == LimSimTM(search=None, search_every=2) and mine.around.search is not None
     assert list(variants(PDMClosed(), constant_velocity)) == ["prediction", "planning"]
     assert variants(LikeTraffic(), constant_velocity) == {}
+
+
+def test_a_view_that_errs_is_a_module():
+    poor = View(range=80.0, misses=0.3, position_noise=0.5, speed_noise=0.2, latency=0.5, occlusion=True)
+    exact = View(range=80.0)
+    assert poor.without_errors() == exact == exact.without_errors()
+    policy = LimSimTM(search_every=2, view=poor)
+    found = variants(policy, constant_velocity)
+    assert list(found) == ["perception", "prediction", "decision", "planning"]
+    assert found["perception"] == replace(policy, view=exact)
+    others = [found[name] for name in ("prediction", "decision", "planning")]
+    assert all(isinstance(x, Policy) and x.view == poor and not x.privileged for x in others)
+    assert list(variants(ConstantSpeed(view=poor), constant_velocity)) == ["perception"]
+    assert variants(ConstantSpeed(view=exact), constant_velocity) == {}
+    assert variants(ConstantSpeed(view=poor, privileged=True), constant_velocity) == {}
+    around = AreaOfInterest(around=policy, slots=2)
+    mine = variants(around, constant_velocity)["perception"]
+    assert isinstance(mine, AreaOfInterest) and mine.ego == LimSimTM(search_every=2, view=exact)
+    assert mine.around == policy

@@ -66,5 +66,6 @@ def film_of(time, pose, *, names=("front", "back"), layers=(-0.1, 0.0), size=(4.
     truth = Bodies(**bodies, there=there)
     return Film(
         time=time, step=np.arange(frames), rig=rig, pictures=pictures, scan=scan, bev=bev,
-        objects=Objects(**columns), truth=truth, pose=place, raster=RASTER, size=size, title="a scene",
+        objects=Objects(**columns),
+        truth=truth, hits=np.zeros((frames, 1), int), pose=place, raster=RASTER, size=size, title="a scene",
     )  # fmt: skip

@@ -76,6 +76,11 @@ class View:
         if not self.range > 0:
             raise ValueError(f"view.range: {self.range} m; expected more than 0")
 
+    def without_errors(self) -> View:
+        """The same view of all within its range, exact and at once."""
+        errors = ("position_noise", "speed_noise", "misses", "latency")
+        return replace(self, occlusion=False, **dict.fromkeys(errors, 0.0))
+
     def late(self, config: Config) -> int:
         """Decisions that the picture is old.
 
