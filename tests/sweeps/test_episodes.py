@@ -109,15 +109,6 @@ def test_the_module_that_is_to_blame():
     assert blind._reruns._references == {}
 
 
-def test_perception_is_to_blame_where_a_planner_with_exact_sight_avoids_the_contact():
-    blind = episodes("modular_policy:Blind")
-    assert list(blind._reruns._references) == ["perception"]
-    rows = [blind.replay(seed).moments[0] for seed in SEEDS]
-    hit = [row for row in rows if row["kind"] == "contact"]
-    assert hit, "otherwise this tells nothing"
-    assert [row["module"] for row in hit] == ["perception"] * len(hit)
-
-
 def test_a_brief_replay_is_the_beginning_of_the_whole_one(monkeypatch):
     run = episodes("like_traffic")
     monkeypatch.setattr(episode, "AFTERWARDS", 1.0)
