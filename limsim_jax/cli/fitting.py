@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -76,7 +77,6 @@ def calibrate(
     limsim-jax calibrate pairs.csv --columns time=t,x_lead=leader,x=follower --length 4.5
     """
     import json
-    from functools import partial
 
     from limsim_jax.calibration.closed_loop import (
         SPEED_LIMIT,
@@ -176,22 +176,44 @@ def _ranges(text: str | None, option: str) -> dict[str, tuple[float, float]] | N
 
 
 def train(
-    what: Annotated[Literal["pdm-hybrid"], typer.Argument(help="What to train.")],
-    out: Annotated[Path, typer.Option(help="Write the weights here.")] = Path("pdm_hybrid.npz"),
-    seeds: Annotated[int, typer.Option(help="Worlds of each scenario to learn from.")] = 48,
-    epochs: Annotated[int, typer.Option(help="Passes through the data.")] = 60,
-    policy: Annotated[str, typer.Option(help="Drives in the worlds to learn from.")] = "like_traffic",
+    what: Annotated[Literal["pdm-hybrid", "end-to-end"], typer.Argument(help="What to train.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Write the weights here.  [default: its name with .npz]")
+    ] = None,
+    seeds: Annotated[int, typer.Option(help="pdm-hybrid: worlds of each scenario to learn from.")] = 48,
+    epochs: Annotated[int, typer.Option(help="pdm-hybrid: passes through the data.")] = 60,
+    policy: Annotated[
+        str, typer.Option(help="pdm-hybrid: drives in the worlds to learn from.")
+    ] = "like_traffic",
+    rounds: Annotated[int, typer.Option(help="end-to-end: rounds of DAgger after cloning the expert.")] = 2,
+    worlds: Annotated[int, typer.Option(help="end-to-end: worlds of a scenario that run at once.")] = 32,
+    minutes: Annotated[float, typer.Option(help="end-to-end: all of it, compiling included.")] = 18.0,
+    scenarios: Annotated[
+        str | None, typer.Option(help="end-to-end: names or files, by commas.  [default: the five]")
+    ] = None,
 ) -> None:
-    """Train a policy's network on rollouts of the bundled scenarios."""
-    del what  # there is one
-    from limsim_jax.training import train as fit
+    """Train a policy's network on rollouts of the bundled scenarios.
+
+    Ctrl-C ends the training of end-to-end early; it writes the best weights so far.
+    """
     from limsim_jax.xla import enable_compilation_cache, use_all_cores
 
+    out = Path(f"{what.replace('-', '_')}.npz") if out is None else out
     check_writable(out)
     if seeds < 1:
         raise typer.BadParameter(f"{seeds} seeds; at least 1", param_hint="--seeds")
     use_all_cores()
     enable_compilation_cache()
-    report = fit(out, seeds=seeds, epochs=epochs, policy=policy, tell=print)
-    print(report)
+    if what == "end-to-end":
+        from limsim_jax.training import end_to_end
+
+        names = end_to_end.SCENARIOS if scenarios is None else [x for x in scenarios.split(",") if x]
+        tell = partial(print, flush=True)
+        print(
+            end_to_end.train(out, scenarios=names, rounds=rounds, worlds=worlds, minutes=minutes, tell=tell)
+        )
+    else:
+        from limsim_jax.training import train as fit
+
+        print(fit(out, seeds=seeds, epochs=epochs, policy=policy, tell=print))
     print(f"wrote {out}")

@@ -258,6 +258,8 @@ class HostPolicy(Policy):
     failures: dict[bytes, str] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        if self.knows == "sensors":  # they look at the world itself, not at a view of it
+            object.__setattr__(self, "privileged", True)
         if self.command not in get_args(Kind):
             raise ValueError(f"command: '{self.command}'; known are {', '.join(get_args(Kind))}")
         if self.memory < 0:
@@ -271,6 +273,11 @@ class HostPolicy(Policy):
     def free(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether its egos move in the plane; with meta-actions they keep to lanes."""
         return self.command != "meta"
+
+    @property
+    def knows(self) -> str | None:
+        """What `observe` says that it knows: "sensors", or None."""
+        return getattr(self.observe, "knows", None)
 
     @property
     def needs_scenery(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -7,6 +7,7 @@ from typing import Any
 
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic, PolicyLike, build_policy
+from limsim_jax.policies.end_to_end import EndToEnd
 from limsim_jax.policies.language.driver import language
 from limsim_jax.policies.language.rules import RuleTable
 from limsim_jax.policies.limsim_tm import LimSimTM
@@ -66,6 +67,7 @@ POLICIES: dict[str, Callable[..., PolicyLike]] = {
     "limsim_tm": LimSimTM,
     "limsim_tm_privileged": _preset(LimSimTM, privileged=True, name="limsim_tm_privileged"),
     "area_of_interest": area_of_interest,
+    "end_to_end": EndToEnd,
     "rule_table": RuleTable,
     "language": language,
 }

@@ -41,8 +41,8 @@ from limsim_jax.training.hybrid import SCENARIOS
 FIRST_SEED = 2_000_000
 """First seed of training; sweeps start at 0, so that no result is of a world seen in training."""
 
-HELD_OUT = 0.1
-"""Share of the samples that are held out: whole segments of a world."""
+HELD_OUT = 10
+"""One in so many segments is held out, with all its worlds."""
 
 KEPT = 40_000
 """Samples that are kept at most, 0.9 GB; of more, old ones are replaced at random."""
@@ -129,13 +129,15 @@ class Store:
         self.parts: dict[bool, list[Sample]] = {False: [], True: []}
         self.counts: dict[str, int] = {}
         self._joined: dict[bool, Sample] = {}
+        self._added = 0
 
     def add(self, scenario: str, samples: Sample) -> None:
         """Keep samples `[S, ...]`; some are held out, whole segments of them."""
         count = len(samples.good)
         if not count:
             return
-        held = bool(self.rng.random() < HELD_OUT) or (bool(self.parts[False]) and not self.parts[True])
+        held = self._added % HELD_OUT == 1
+        self._added += 1
         self.parts[held].append(samples)
         self._joined.pop(held, None)
         self.counts[scenario] = self.counts.get(scenario, 0) + count

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from traffic_worlds import bundled, motorway, state_of
 
-from limsim_jax.policies.end_to_end import EndToEnd, network
+from limsim_jax.policies.base import knows, needs_scenery
+from limsim_jax.policies.end_to_end import EndToEnd, ObserveSensors, network
+from limsim_jax.policies.end_to_end import policy as policy_module
 from limsim_jax.policies.end_to_end.control import (
     BRAKING,
     MARGIN,
@@ -43,8 +45,9 @@ from limsim_jax.policies.end_to_end.network import (
     target_speed,
     two_hot,
 )
+from limsim_jax.policies.host import HostPolicy
 from limsim_jax.sensors.faults import Faults
-from limsim_jax.sensors.rig import LAYERS_1, Camera, Rig
+from limsim_jax.sensors.rig import LAYERS_1, Camera, Rig, six_cameras
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.types import Config
@@ -292,7 +295,11 @@ def test_weights_come_back_from_the_disk(tmp_path):
         lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-4), back.weights, dict(wanted)
     )
     assert parameters(back.weights) == parameters(wanted)
-    assert EndToEnd(str(file)).trained is back
+    policy = EndToEnd(str(file))
+    assert policy.trained.about == back.about
+    save_weights(file, Trained(Design(hidden=24), fresh_weights(Design(hidden=24), 4), {}))
+    again = EndToEnd(str(file))  # other weights under the same name are another policy
+    assert again.content != policy.content == EndToEnd(network=back).content
 
 
 def refused(match, **options):
@@ -302,7 +309,7 @@ def refused(match, **options):
 
 
 def test_bad_weights_are_refused_in_one_line(tmp_path):
-    refused("nowhere.npz: no such file of weights", weights=str(tmp_path / "nowhere.npz"))
+    refused("nowhere.npz: no weights: No such file", weights=str(tmp_path / "nowhere.npz"))
     text = tmp_path / "text.npz"
     text.write_text("hello")
     refused("text.npz: no weights of an end-to-end driver", weights=str(text))
@@ -318,6 +325,21 @@ def test_bad_weights_are_refused_in_one_line(tmp_path):
     )
     save_weights(tmp_path / "less.npz", Trained(Design(), {"path": wrong["path"]}, {}))
     refused("less.npz: .* is missing", weights=str(tmp_path / "less.npz"))
+
+
+def test_without_weights_it_says_how_to_make_them(monkeypatch, tmp_path):
+    monkeypatch.setattr(policy_module, "WEIGHTS", tmp_path / "none.npz")
+    refused("weights: none come with this version; `limsim-jax train end-to-end`")
+
+
+def test_planners_on_the_host_may_have_the_same_sensors():
+    planner = HostPolicy(lambda seen: {}, observe=ObserveSensors())
+    assert planner.privileged and needs_scenery(planner) and knows(planner) == "sensors"
+    assert not HostPolicy(lambda seen: {}).privileged and knows(HostPolicy(lambda seen: {})) == "view"
+    six = ObserveSensors(six_cameras(32, 18, lidar=LAYERS_1))  # any rig, unlike our own network
+    assert len(six.rig.cameras) == 6
+    with pytest.raises(ValueError, match="rig: cameras and a lidar are needed"):
+        ObserveSensors(Rig(lidar=LAYERS_1))
 
 
 def test_rigs_and_faults_that_do_not_fit_are_refused():

@@ -4,4 +4,5 @@
 them. `limsim_jax.training.end_to_end` trains it.
 """
 
+from limsim_jax.policies.end_to_end.observe import ObserveSensors as ObserveSensors
 from limsim_jax.policies.end_to_end.policy import EndToEnd as EndToEnd

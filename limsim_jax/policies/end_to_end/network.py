@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 import io
 import json
 import zipfile
@@ -276,7 +277,6 @@ def save_weights(path: str | Path, trained: Trained) -> None:
     write_whole(path, file.getvalue())
 
 
-@functools.lru_cache(maxsize=8)
 def load_weights(path: str) -> Trained:
     """Read what `save_weights` wrote.
 
@@ -284,14 +284,21 @@ def load_weights(path: str) -> Trained:
       ValueError: no such file, or weights of another network; one line.
     """
     try:
-        with np.load(path) as file:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path}: no weights: {error.strerror}") from None
+    return _read(path, content)
+
+
+@functools.lru_cache(maxsize=8)
+def _read(path: str, content: bytes) -> Trained:
+    try:
+        with np.load(io.BytesIO(content)) as file:
             told = json.loads(str(file["about"]))
             flat = {name: np.asarray(file[name], np.float32) for name in file.files if name != "about"}
         if told["format"] != _MAGIC:
             raise KeyError("format")
         design = Design(**told["design"])
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file of weights") from None
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: no weights of an end-to-end driver: {error}") from None
     weights: dict[str, dict[str, np.ndarray]] = {}
@@ -315,6 +322,20 @@ def check_weights(path: str, design: Design, weights: Mapping[str, Mapping[str, 
             if found is None or found.shape != value.shape:
                 shape = "missing" if found is None else f"of shape {list(found.shape)}"
                 raise ValueError(f"{path}: {layer}/{name} is {shape}; this network has {list(value.shape)}")
+
+
+def digest(trained: Trained) -> str:
+    """A hash of a network: results of other weights are other results.
+
+    Weights within a function that is being traced have none.
+    """
+    leaves = jax.tree.leaves(trained.weights)
+    if any(isinstance(x, jax.core.Tracer) for x in leaves):
+        return ""
+    told = hashlib.sha256(repr(trained.design).encode())
+    for x in leaves:
+        told.update(np.asarray(x, np.float32).tobytes())
+    return told.hexdigest()[:16]
 
 
 def parameters(weights: Any) -> int:

@@ -37,6 +37,7 @@ from limsim_jax.policies.end_to_end.network import (
     Network,
     Outputs,
     Trained,
+    digest,
     load_weights,
     path_places,
     target_speed,
@@ -90,6 +91,7 @@ class EndToEnd(Policy):
       faults: of its sensors; a table in a file.
       rig: of its vehicles; None: the one that the network was trained with.
       network: in the place of `weights`, as training has it.
+      content: a hash of the network.
 
     Raises:
       ValueError: no such file, weights of another network, or a rig without the cameras that it needs.
@@ -100,7 +102,8 @@ class EndToEnd(Policy):
     steers: bool = True
     faults: Faults | Mapping[str, Any] | None = None
     rig: Rig | None = None
-    network: Trained | None = field(default=None, repr=False)
+    network: Trained | None = field(default=None, repr=False, compare=False)
+    content: str = field(default="", init=False, repr=False)
     privileged: bool = field(default=True, kw_only=True)
 
     needs_scenery = True
@@ -119,7 +122,8 @@ class EndToEnd(Policy):
             self.sensors.rig.check(*self.faults.dropped, *self.faults.frozen)
             if self.faults.delay:
                 raise ValueError(f"faults: delay: {self.faults.delay} s; the driver has none")
-        _ = self.sensors, self.trained
+        _ = self.sensors
+        object.__setattr__(self, "content", digest(self.trained))
 
     @property
     def sensors(self) -> Sensors:
@@ -129,7 +133,13 @@ class EndToEnd(Policy):
     @property
     def trained(self) -> Trained:
         """The network."""
-        return self.network or load_weights(str(WEIGHTS) if self.weights is None else self.weights)
+        if self.network is not None:
+            return self.network
+        if self.weights is None and not WEIGHTS.exists():
+            raise ValueError(
+                "weights: none come with this version; `limsim-jax train end-to-end` makes a file of them"
+            )
+        return load_weights(str(WEIGHTS) if self.weights is None else self.weights)
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Memory:
         """No LiDAR points yet."""
