@@ -18,6 +18,10 @@ PAPER = {"highway": 76.3, "ramp": 64.6, "intersection": 86.3, "roundabout": 72.1
 """Driving scores of LimSim-TM in the LimSim paper, and with that its five scenarios."""
 
 
+INTERFUSER = {"highway": 51.0, "ramp": 54.2, "intersection": 65.2, "roundabout": 28.0, "long_route": 37.6}
+"""Driving scores of InterFuser in the LimSim paper."""
+
+
 def carla(result: dict[str, Any]) -> str:
     """The towns of CARLA one by one, other maps together."""
     rows = [
@@ -310,6 +314,37 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
             for r in result["own"]
         )
         rows += ["", f"Policies of 20 lines (`experiments/own_policies.py`): {'; '.join(told)}."]
+    return "\n".join(rows)
+
+
+def end_to_end(result: dict[str, Any]) -> str:
+    """Scenarios and variants of the end-to-end driver, and the card of its network."""
+    rows = [
+        "| scenario | driver | seeds | success, % | route completion, % | LimSim driving score "
+        "| contact at fault, % | off the road, % |",
+        "|---|---|---:|---|---:|---|---:|---:|",
+    ]
+    for r in result["rows"]:
+        (success, low, high), (score, least, most) = ([100 * x for x in r[k]] for k in ("success", "score"))
+        where = f"{r['scenario']}, held out" if r["held_out"] else r["scenario"]
+        theirs = INTERFUSER.get(r["scenario"]) if r["driver"] == "end-to-end" else None
+        rows.append(
+            f"| {where} | {r['driver']} | {r['seeds']} | {success:.1f} [{low:.1f}, {high:.1f}] "
+            f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}]"
+            f"{'' if theirs is None else f' ({theirs})'} "
+            f"| {100 * r['at_fault_contacts'][0]:.1f} | {100 * r['off_road'][0]:.1f} |"
+        )
+    about = result["about"]
+    samples = ", ".join(f"{name} {count:,}" for name, count in about["samples"].items())
+    last = about["curve"][-1] if about["curve"] else {}
+    rows += [
+        "",
+        f"The network: {about['parameters']:,} parameters, trained in {about['seconds'] / 60:.1f} min on "
+        f"{about['device']} with version {about['version']} and JAX {about['jax']}. Samples: {samples}; "
+        f"seeds from {min(first for first, _ in about['seeds'].values()):,} on; {about['rounds']} rounds "
+        f"of DAgger, {about['steps']:,} steps. Losses of held-out samples at the end: "
+        f"{', '.join(f'{k} {v:g}' for k, v in last.items() if k not in ('s', 'phase', 'loss'))}.",
+    ]
     return "\n".join(rows)
 
 
