@@ -318,7 +318,7 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
 
 
 def end_to_end(result: dict[str, Any]) -> str:
-    """Scenarios and variants of the end-to-end driver, and the card of its network."""
+    """Variants of the end-to-end driver by scenario, and its card."""
     rows = [
         "| scenario | driver | seeds | success, % | route completion, % | LimSim driving score "
         "| contact at fault, % | off the road, % |",

@@ -42,7 +42,7 @@ FIRST_SEED = 2_000_000
 """First seed of training; sweeps start at 0, so that no result is of a world seen in training."""
 
 HELD_OUT = 10
-"""One in so many segments is held out, with all its worlds."""
+"""Of ten segments one is held out, with all its worlds."""
 
 KEPT = 40_000
 """Samples that are kept at most, 0.9 GB; of more, old ones are replaced at random."""

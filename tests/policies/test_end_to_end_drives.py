@@ -68,7 +68,7 @@ def test_labels_are_those_of_a_driver_on_its_route(trained):
     assert (labels.change >= -8).all() and (labels.change <= 3).all()
     pictures = samples.inputs.cameras
     assert len(np.unique(pictures.reshape(-1, 3), axis=0)) > 10
-    assert samples.inputs.raster[:, 0].any()  # the LiDAR meets somebody
+    assert samples.inputs.raster[:, 0].any()  # the LiDAR meets vehicles
     there = labels.density[..., 0] > 0
     assert there.any() and np.abs(labels.density[there][:, 1:3]).max() <= 0.5 + 1e-5
 

@@ -34,7 +34,7 @@ _LAY = 64  # places along a path between which it is straight
 
 
 class Way(NamedTuple):
-    """A path of each ego as points `[E, M]`, evenly spaced along the route."""
+    """A path of each ego: points evenly spaced along the route."""
 
     x: Float[Array, "E M"]  # m
     y: Float[Array, "E M"]
@@ -43,7 +43,7 @@ class Way(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Driven motion of each ego, `[E, SAMPLES]`, of the middle of the body."""
+    """Driven motion of each ego, of the middle of its body."""
 
     x: Float[Array, "E T"]  # m
     y: Float[Array, "E T"]
@@ -144,7 +144,7 @@ def pursue(
 
 
 def arc_through(x: Array, y: Array, heading: Array, to_x: Array, to_y: Array) -> Array:
-    """Curvature (1/m) of the arc that begins at a pose and passes through a point (pure pursuit)."""
+    """Curvature (1/m) of the arc from a pose through a point."""
     dx, dy = to_x - x, to_y - y
     across = jnp.cos(heading) * dy - jnp.sin(heading) * dx
     return 2 * across / jnp.maximum(dx * dx + dy * dy, 1.0)
@@ -180,7 +180,7 @@ _PLACES = 32  # poses along the path that are tried
 
 
 class Objects(NamedTuple):
-    """What the density map holds, `[E, K]`, in the frames of the egos."""
+    """What the density map holds, in the frames of the egos."""
 
     x: Float[Array, "E K"]  # m
     y: Float[Array, "E K"]
@@ -192,7 +192,10 @@ class Objects(NamedTuple):
 
 
 def cell_middles() -> tuple[np.ndarray, np.ndarray]:
-    """Middles of the cells of the density map, m, `[16, 1]` and `[1, 12]`."""
+    """Middles of the cells of the density map, m.
+
+    Shapes are `[16, 1]` and `[1, 12]`.
+    """
     rows, columns = (round(n * RASTER.cell / CELL) for n in RASTER.shape)
     x = (np.arange(rows) + 0.5) * CELL - RASTER.behind
     y = (np.arange(columns) + 0.5) * CELL - RASTER.side
@@ -221,7 +224,7 @@ def objects_of(density: Float[Array, "E R S 8"]) -> Objects:
 def free_distances(
     way: Way, objects: Objects, length: Float[Array, " E"], width: Float[Array, " E"]
 ) -> Float[Array, "E 5"]:
-    """m that each ego can drive on its path until it meets an object, at `MOMENTS`.
+    """Distances (m) on the path to an object, at `MOMENTS`.
 
     An object that overlaps the ego where it stands does not count: it is the map's error, or too late.
     """
@@ -269,7 +272,9 @@ def filtered(
     held: Float[Array, " E"],
     dt: float,
 ) -> tuple[Float[Array, " E"], Float[Array, " E"]]:
-    """The target speed after the filter, and for how long it alone has held the ego.
+    """The target speed after the filter, and how long that has held.
+
+    Only time counts in which the network alone would have gone.
 
     Args:
       v: m/s, now.

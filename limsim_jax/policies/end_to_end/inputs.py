@@ -118,7 +118,7 @@ SPEED, ACCELERATION, ACROSS, LANES, FAR = 20.0, 4.0, 4.0, 2.0, 300.0
 
 
 class Points(NamedTuple):
-    """LiDAR points of a decision, in the map, so that a later decision can use them."""
+    """LiDAR points of a decision, in the map: the next decision uses them, too."""
 
     x: Float[Array, "E P"]  # m
     y: Float[Array, "E P"]
@@ -279,7 +279,10 @@ def _raster(
 def _nearest(
     s: Float[Array, "E P"], d: Float[Array, "E P"], there: Bool[Array, "E P"]
 ) -> Float[Array, "E D 2"]:
-    """Distance (m) along the route to the nearest point of each band, ahead and behind."""
+    """Distance (m) along the route to the nearest point of each band.
+
+    The last axis is ahead and behind.
+    """
     edges = jnp.asarray(BANDS, jnp.float32)
     within = (d[:, None] > edges[None, :-1, None]) & (d[:, None] <= edges[None, 1:, None]) & there[:, None]
     along = jnp.broadcast_to(s[:, None], within.shape)
