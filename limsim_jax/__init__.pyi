@@ -40,6 +40,8 @@ from .policies.area import AreaOfInterest as AreaOfInterest
 from .policies.base import LikeTraffic as LikeTraffic
 from .policies.base import Policy as Policy
 from .policies.base import named as named
+from .policies.end_to_end import EndToEnd as EndToEnd
+from .policies.end_to_end import ObserveSensors as ObserveSensors
 from .policies.host import HostPolicy as HostPolicy
 from .policies.host import Observation as Observation
 from .policies.limsim_tm import LimSimTM as LimSimTM

@@ -29,10 +29,10 @@ NAMES = {
     "Rare events": ["rare_event", "RareEvent"],
     "Policies": [
         *("LikeTraffic", "ConstantSpeed", "FollowLane", "PDMClosed", "PDMHybrid", "LimSimTM"),
-        *("AreaOfInterest", "named"),
+        *("EndToEnd", "AreaOfInterest", "named"),
     ],
     "Policies of one's own": [
-        *("Policy", "HostPolicy", "Observation", "Command", "Control", "Trajectory"),
+        *("Policy", "HostPolicy", "Observation", "ObserveSensors", "Command", "Control", "Trajectory"),
         *("reference_path", "to_cartesian"),
     ],
     "Sensors": [

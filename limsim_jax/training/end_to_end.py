@@ -41,8 +41,8 @@ from limsim_jax.training.hybrid import SCENARIOS
 FIRST_SEED = 2_000_000
 """First seed of training; sweeps start at 0, so that no result is of a world seen in training."""
 
-HELD_OUT = 10
-"""Of ten segments one is held out, with all its worlds."""
+HELD_OUT = 11
+"""Of eleven segments one is held out, with all its worlds: with five scenarios, each in its turn."""
 
 KEPT = 40_000
 """Samples that are kept at most, 0.9 GB; of more, old ones are replaced at random."""
@@ -64,7 +64,7 @@ WEIGHTS = {"path": 1.0, "speed": 1.0, "waypoints": 0.3, "density": 0.5, "rules":
 
 _SHARES = {"clone": 0.45, "round": 0.55}  # of the time that is left after compiling
 _COLLECTS = 0.45  # share of a phase in which samples are collected
-_LOOK_EVERY = 100  # steps
+_LOOK_EVERY, _LOOK_AT = 100, 1024  # steps, and held-out samples that are looked at
 
 
 class Losses(NamedTuple):
@@ -243,8 +243,8 @@ class Learner:
     def look(self, store: Store) -> Losses:
         """Losses of held-out samples; weights that are the best so far are kept."""
         held = store.samples(held=True)
-        count = min(len(held.good), 1024)
-        which = np.linspace(0, len(held.good) - 1, 1024).astype(int) if count else []
+        many = _LOOK_AT - _LOOK_AT % len(self.mesh.devices)
+        which = np.linspace(0, len(held.good) - 1, many).astype(int)
         some = jax.device_put(jax.tree.map(lambda x: x[which], held), self._apart)
         value, parts = self._losses(self.weights, some)
         if float(value) < self.best[0]:
@@ -366,7 +366,7 @@ class _Training:
         """All programs, two at a time."""
         count = parameters(self.learner.weights)
         self.tell(f"compiling {len(self.fields)} scenarios; the network has {count:,} parameters")
-        weights = self.learner.weights
+        weights = self.learner.best[1]
 
         def one(field: Field) -> None:
             field.compile(weights)
@@ -380,7 +380,7 @@ class _Training:
         began = self.elapsed
         while self.elapsed - began < seconds * _COLLECTS or not self._enough():
             field = next(self._turn)
-            weights = self.learner.best[1] if lead < 1 else self.learner.weights
+            weights = self.learner.best[1]
             self.store.add(field.scenario, field.segment(weights, lead, self.rng))
         told = ", ".join(f"{name} {count:,}" for name, count in self.store.counts.items())
         self.tell(f"{name}: samples so far: {told}")

@@ -193,13 +193,9 @@ def test_on_a_straight_way_the_vehicle_goes_straight_and_reaches_its_speed():
 def test_on_a_circle_the_vehicle_follows_it():
     radius, step = 25.0, 0.5
     angle = step * np.arange(64) / radius
-    way = Way(
-        *(
-            jnp.asarray(x[None], jnp.float32)
-            for x in (radius * np.sin(angle), radius * (1 - np.cos(angle)), angle)
-        ),
-        jnp.full(1, step),
-    )
+    x, y = radius * np.sin(angle), radius * (1 - np.cos(angle))
+    x, y, heading = (jnp.asarray(values[None], jnp.float32) for values in (x, y, angle))
+    way = Way(x, y, heading, jnp.full(1, step))
     motion = pursue(way, jnp.full(1, 8.0), jnp.full(1, 8.0), jnp.full(1, 2.8))
     off = np.hypot(motion.x, motion.y - radius) - radius
     assert np.abs(off).max() < 0.25

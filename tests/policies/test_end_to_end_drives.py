@@ -78,6 +78,7 @@ def test_the_student_drives_without_a_fault(trained):
     (field,) = run.fields
     field._running = None
     before = field.segment(run.learner.best[1], 0.0, np.random.default_rng(0))
+    assert field._running is not None
     state = field._running.carry.state
     assert len(before.good) > 0
     slot = np.asarray(state.egos.slot)[:, 0]
@@ -89,6 +90,7 @@ def test_the_student_drives_without_a_fault(trained):
     field._running, field.next_seed = None, field.next_seed - field.worlds
     other = end_to_end.fresh_weights(Design(hidden=16), 5)
     field.segment(other, 0.0, np.random.default_rng(0))
+    assert field._running is not None
     moved = np.hypot(
         np.asarray(field._running.carry.state.egos.x) - np.asarray(state.egos.x),
         np.asarray(field._running.carry.state.egos.y) - np.asarray(state.egos.y),

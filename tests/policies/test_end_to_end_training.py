@@ -1,6 +1,7 @@
 """Training of the end-to-end driver without the traffic engine: losses, samples, steps, what is refused."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,30 +25,31 @@ from limsim_jax.training.end_to_end import Learner, Losses, Store, importance, l
 DESIGN = Design(cameras=False, hidden=32)
 
 
-def labels(count, change=0.0, **changes) -> Labels:
+def labels(count: int, change: Any = 0.0, **changes: Any) -> Any:
     """Labels of moments on an empty road."""
     rows, columns = density_shape()
-    plain = Labels(
+    plain: Any = dict(
         path=np.zeros((count, 10), np.float32),
         known=np.ones((count, 10), bool),
         change=np.full(count, change, np.float32),
         waypoints=np.zeros((count, 8, 2), np.float32),
         density=np.zeros((count, rows, columns, 8), np.float32),
         rules=np.zeros((count, 3), bool),
-    )  # pyright: ignore[reportArgumentType]
-    return plain._replace(**changes)
+    )
+    return Labels(**(plain | changes))
 
 
-def samples(count: int) -> Sample:
+def samples(count: int) -> Any:
     """Moments in which what is ahead says what to do: brake for a point that is near."""
     draw = np.random.default_rng(1)
     near = draw.random(count) < 0.5
-    inputs = jax.tree.map(np.array, blank_inputs(count))
+    inputs: Any = jax.tree.map(np.array, blank_inputs(count))
     inputs.bands[:, :, 5, 0] = np.where(near, 8.0, 80.0)[:, None]
     inputs.ego[:, 0] = 0.5
     change = np.where(near, -3.0, 1.0).astype(np.float32)
     path = np.where(near, 1.0, 0.0)[:, None].repeat(10, 1).astype(np.float32)
-    return Sample(inputs, labels(count, change=change, path=path), np.ones(count, bool))
+    good: Any = np.ones(count, bool)
+    return Sample(inputs, labels(count, change=change, path=path), good)
 
 
 cost = jax.jit(losses)
@@ -132,6 +134,7 @@ def test_rare_and_important_moments_are_drawn_more_often():
     np.testing.assert_allclose(importance(told, ego), [1, 3, 3, 3])
 
 
+@pytest.mark.engine  # it compiles a step of training
 def test_the_loss_of_a_toy_batch_falls_and_the_best_weights_are_kept(monkeypatch):
     monkeypatch.setattr(end_to_end, "BATCH", 32)
     learner = Learner(DESIGN)

@@ -23,6 +23,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from limsim_jax.files import write_whole
@@ -330,7 +331,7 @@ def digest(trained: Trained) -> str:
     Weights within a function that is being traced have none.
     """
     leaves = jax.tree.leaves(trained.weights)
-    if any(isinstance(x, jax.core.Tracer) for x in leaves):
+    if any(isinstance(x, Tracer) for x in leaves):
         return ""
     told = hashlib.sha256(repr(trained.design).encode())
     for x in leaves:

@@ -21,8 +21,8 @@ ROUTE_POINTS = 48
 class SensorArrays(NamedTuple):
     """What the sensors of the egos give.
 
-    A planner on the host gets `[B, E, ...]`. `C` cameras of `H` x `W` pixels, `R` layers and `A` directions of
-    the LiDAR. The route is in the frame of the ego: x ahead of the middle of its body, y to the left.
+    A planner on the host gets `[B, E, ...]`. `C` cameras of `H` x `W` pixels, `R` layers and `A` directions
+    of the LiDAR. The route is in the frame of the ego: x ahead of the middle of its body, y to the left.
     """
 
     cameras: UInt8[Array, "E C H W 3"]  # red, green, blue
