@@ -49,6 +49,7 @@ from .policies.pdm import PDMClosed as PDMClosed
 from .policies.pdm import PDMHybrid as PDMHybrid
 from .policies.reference import reference_path as reference_path
 from .policies.reference import to_cartesian as to_cartesian
+from .policies.sensed import ObserveScaled as ObserveScaled
 from .policies.simple import ConstantSpeed as ConstantSpeed
 from .policies.simple import FollowLane as FollowLane
 from .policies.vector import ObserveVector as ObserveVector

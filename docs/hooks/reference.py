@@ -46,7 +46,7 @@ NAMES = {
         "Film",
         "Perception",
     ],
-    "Step by step": ["Env", "ObserveVector", "RouteReward"],
+    "Step by step": ["Env", "ObserveVector", "ObserveScaled", "RouteReward"],
     "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "Population", "default_population"],
     "Log replay": ["load_scene", "Scene"],
     "Beside other tools": [

@@ -17,6 +17,7 @@ from limsim_jax.geometry import boxes_overlap
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.map import Map
 from limsim_jax.metrics.scores import NUPLAN_OVERSPEED, NUPLAN_TTC
+from limsim_jax.policies.base import needs_scenery, with_scenery
 from limsim_jax.policies.host import Kind, Observation, Observe, command_from
 from limsim_jax.policies.predict import constant_velocity, nearest
 from limsim_jax.policies.view import view_of
@@ -165,6 +166,7 @@ class Env:
 
     Observations are those of `policies.host.Observation`, actions those of `HostPolicy`, for one world:
     leaves `[E, ...]` for `E` egos. The egos see by the `view` of the experiment unless it says `privileged`.
+    Sensors (`lj.ObserveScaled`, `lj.ObserveSensors`) look at the world itself.
 
     - "control": `acceleration` (m/s^2) and `steering` (rad), `[E]`;
     - "trajectory": `x`, `y` (m), `heading` (rad), `v` (m/s), `[E, samples]`, in the frame of the ego, every
@@ -210,7 +212,7 @@ class Env:
         self._view = None if ego.privileged else view_of(ego.view)
         driver = _Commanded(action != "meta")
         self._episodes: Episodes = self.experiment.episodes(driver, chunk=1)
-        self.lanes = self._episodes.lane_map
+        self.lanes = with_scenery(self.observe, self._episodes.town, self._episodes.lane_map)
         self.egos = self._episodes.egos
         self._run: Rollout = replace(self._episodes.rollout, policy=driver, measure=None, record=None)
         self.config = self._run.config
@@ -291,7 +293,9 @@ class Env:
         lanes = lanes_now(self.config, self.lanes, schedule, state)
         if self._view is not None:
             now = jax.random.fold_in(key, state.step)
-            state, sight = self._view.look(self.config, lanes, state, sight, now)
+            seen, sight = self._view.look(self.config, lanes, state, sight, now)
+            if not needs_scenery(self.observe):
+                state = seen
         return self.observe(self.config, lanes, state), sight
 
     def _info(self, before: State, after: State, route: Float[Array, " E"]) -> Info:
