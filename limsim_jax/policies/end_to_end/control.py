@@ -173,6 +173,9 @@ TOO_NEAR = 2.0
 UNBLOCK = 12.0
 """s that the filter alone may hold a standing ego (InterFuser: 60 s). Chosen: shorter than a red phase."""
 
+PASS = 3.0
+"""s for which it then lets the ego go. Chosen: enough to get past what is not there."""
+
 RED, AT_JUNCTION = 0.3, 0.5
 """Probabilities of a red light and of a junction from which a standing ego stays (InterFuser: 0.3)."""
 
@@ -287,6 +290,6 @@ def filtered(
     chance = jax.nn.sigmoid(rules)
     red = (chance[:, 1] > RED) & (chance[:, 0] > AT_JUNCTION) & (v < 0.5)
     safe = jnp.where(red, 0.0, jnp.minimum(target, safe_speed(v, free)))
-    holds = (v < 0.5) & (target > 0.5) & (safe < 0.5) & ~red
-    lets = holds & (held >= UNBLOCK)
-    return jnp.where(lets, target, safe), jnp.where(holds, held + dt, 0.0)
+    holds = (v < 0.5) & (target > 0.5) & (safe < 0.5) & ~red & (held < UNBLOCK)
+    passes = (held >= UNBLOCK) & (held < UNBLOCK + PASS) & ~red
+    return jnp.where(passes, target, safe), jnp.where(passes | holds, held + dt, 0.0)

@@ -22,7 +22,7 @@ from limsim_jax.sensors.camera import Pictures, take_pictures
 from limsim_jax.sensors.lidar import Scan, points_of, scan_around
 from limsim_jax.sensors.rig import Lidar, Rig, front_cameras
 from limsim_jax.sensors.scene import Bodies, Pose, bodies_around, pose_of, scene_of
-from limsim_jax.types import Config, State
+from limsim_jax.types import State
 
 FOCUS = math.radians(40)
 """Horizontal view of the middle camera: a light has a pixel from 88 m on, and no gap to the outer ones."""
@@ -132,7 +132,6 @@ class Look(NamedTuple):
     scan: Scan  # [E, R, A]
     pose: Pose  # [E]
     bodies: Bodies  # [E, K]
-    points: Points
 
 
 @dataclass(frozen=True)
@@ -175,19 +174,35 @@ class Sensors:
         assert lidar is not None
         scene = scene_of(lane_map, scenery, state)
 
-        def one(slot: Int[Array, ""], key: Key[Array, ""]) -> tuple[Pictures, Scan, Pose, Bodies, Points]:
+        def one(slot: Int[Array, ""], key: Key[Array, ""]) -> tuple[Pictures, Scan, Pose, Bodies]:
             pose, bodies = pose_of(scene, slot), bodies_around(scene, scenery, slot)
             pictures, scan = take_pictures(self.rig, scenery, pose, bodies), scan_around(lidar, bodies, key)
-            place, back = points_of(lidar, scan)
-            place, back = place.reshape(-1, 3), back.reshape(-1) & (place[..., 2] > GROUND).reshape(-1)
-            cos, sin = jnp.cos(pose.heading), jnp.sin(pose.heading)
-            x, y = place[:, 0], place[:, 1]
-            points = Points(pose.x + cos * x - sin * y, pose.y + sin * x + cos * y, back)
-            return pictures, scan, pose, bodies, points
+            return pictures, scan, pose, bodies
 
         slot = state.egos.slot
         keys = jax.vmap(lambda k: jax.random.fold_in(key, k))(jnp.arange(slot.shape[0]))
         return Look(*jax.vmap(one)(slot, keys))
+
+
+def points_at(sensors: Sensors, scan: Scan, pose: Pose) -> Points:
+    """LiDAR points above the ground, in the map.
+
+    Args:
+      sensors: of the vehicles.
+      scan: what their LiDAR gave, `[E, R, A]`.
+      pose: where they take themselves to be, `[E]`.
+    """
+    lidar = sensors.rig.lidar
+    assert lidar is not None
+
+    def one(scan: Scan, pose: Pose) -> Points:
+        place, back = points_of(lidar, scan)
+        x, y, z = (place[..., k].reshape(-1) for k in range(3))
+        cos, sin = jnp.cos(pose.heading), jnp.sin(pose.heading)
+        there = back.reshape(-1) & (z > GROUND)
+        return Points(pose.x + cos * x - sin * y, pose.y + sin * x + cos * y, there)
+
+    return jax.vmap(one)(scan, pose)
 
 
 def no_points(sensors: Sensors, state: State) -> Points:
@@ -205,7 +220,6 @@ def route_of(lane_map: LaneMap, state: State) -> ReferencePath:
 
 @jax.named_scope("inputs")
 def inputs_of(
-    config: Config,
     lane_map: LaneMap,
     state: State,
     path: ReferencePath,
@@ -216,15 +230,13 @@ def inputs_of(
     """The inputs of the network.
 
     Args:
-      config: of the run.
       lane_map: the map.
-      state: with the egos; all else of it is left alone.
+      state: with the egos where they take themselves to be; all else of it is left alone.
       path: their routes.
       color: of the pictures.
       now: LiDAR points.
       before: those of the last decision.
     """
-    del config
     egos, slot = state.egos, state.egos.slot
     cos, sin = jnp.cos(egos.heading)[:, None], jnp.sin(egos.heading)[:, None]
 

@@ -30,6 +30,7 @@ from limsim_jax.policies.end_to_end.inputs import (
     Sensors,
     inputs_of,
     no_points,
+    points_at,
     route_of,
 )
 from limsim_jax.policies.end_to_end.network import (
@@ -73,6 +74,7 @@ class Seen(NamedTuple):
     """All that a decision is made from."""
 
     look: Look
+    pose: Pose  # [E], where the egos take themselves to be
     path: ReferencePath
     inputs: Inputs
 
@@ -155,17 +157,18 @@ class EndToEnd(Policy):
     ) -> tuple[Seen, Memory]:
         """The inputs of the network now, and the memory."""
         look, faults = self.sensors.look(lane_map, state, key), memory.faults
-        pictures, believed = look.pictures, state
+        pictures, pose = look.pictures, look.pose
         if isinstance(self.faults, Faults):
-            pictures, believed, faults = self._spoiled(config, state, look, memory, key)
-        path = route_of(lane_map, believed)
-        inputs = inputs_of(config, lane_map, believed, path, pictures.color, look.points, memory.points)
-        return Seen(look, path, inputs), memory._replace(points=look.points, faults=faults)
+            pictures, pose, faults = self._spoiled(config, state, look, memory, key)
+        egos = replace(state.egos, x=pose.x, y=pose.y, heading=pose.heading)
+        path, points = route_of(lane_map, state), points_at(self.sensors, look.scan, pose)
+        inputs = inputs_of(lane_map, replace(state, egos=egos), path, pictures.color, points, memory.points)
+        return Seen(look, pose, path, inputs), memory._replace(points=points, faults=faults)
 
     def _spoiled(
         self, config: Config, state: State, look: Look, memory: Memory, key: jax.Array
-    ) -> tuple[Pictures, State, FaultMemory]:
-        """Pictures and places as faults make them."""
+    ) -> tuple[Pictures, Pose, FaultMemory]:
+        """Pictures and poses as faults make them."""
         assert isinstance(self.faults, Faults) and memory.faults is not None
         spoil, dt = self.faults.spoil, config.decision_time
 
@@ -173,9 +176,7 @@ class EndToEnd(Policy):
             return spoil(faults, pictures, pose, dt, jax.random.fold_in(key, k), state.step)
 
         number = jnp.arange(state.egos.slot.shape[0])
-        pictures, pose, faults = jax.vmap(one)(number, memory.faults, look.pictures, look.pose)
-        egos = replace(state.egos, x=pose.x, y=pose.y, heading=pose.heading)
-        return pictures, replace(state, egos=egos), faults
+        return jax.vmap(one)(number, memory.faults, look.pictures, look.pose)
 
     def __call__(
         self, config: Config, lane_map: LaneMap, state: State, memory: Memory, key: jax.Array
@@ -193,8 +194,8 @@ class EndToEnd(Policy):
         """The command for what the network says, and the memory."""
         egos, slot = state.egos, state.egos.slot
         v, shape = state.v[slot], state.shape
-        pose = egos.x, egos.y, egos.heading
-        _, offset, _ = project_onto(seen.path, egos.x[:, None], egos.y[:, None])
+        pose = seen.pose.x, seen.pose.y, seen.pose.heading
+        _, offset, _ = project_onto(seen.path, pose[0][:, None], pose[1][:, None])
         places = path_places(v)
         if not self.steers:
             target = jnp.minimum(seen.path.limit[:, 0], v + 2.0)
