@@ -8,6 +8,7 @@ types describe one world; a batch is a `vmap`. SI units, radians, counter-clockw
 from __future__ import annotations
 
 import enum
+from typing import Any
 
 import jax.numpy as jnp
 from flax import struct
@@ -137,6 +138,23 @@ class Progress:
 
 
 @struct.dataclass(frozen=True, kw_only=True)
+class Outside:
+    """Vehicles that something outside of the traffic moves, `K` of them, as entities of a scenario."""
+
+    slot: Int[Array, " K"]  # -1: none
+    held: Bool[Array, " K"]  # moved from outside now; otherwise by the traffic or a policy
+    there: Bool[Array, " K"]
+    x: Float[Array, " K"]  # m, middle of the body
+    y: Float[Array, " K"]
+    heading: Float[Array, " K"]  # rad
+    v: Float[Array, " K"]  # m/s
+    a: Float[Array, " K"]  # m/s^2
+    box: Float[Array, "K 5"]  # bodies now, as `motion.boxes`
+    over: Bool[Array, ""]  # the episode is at its end
+    memory: Any  # of the player
+
+
+@struct.dataclass(frozen=True, kw_only=True)
 class Schedule:
     """Vehicles that enter from outside: sorted by origin, within an origin by time.
 
@@ -153,6 +171,7 @@ class Schedule:
     shape: Shape  # [V]
     start: Int[Array, " O1"]  # rows start[o] .. start[o + 1] - 1 belong to origin o
     script: Script | None = None  # orders of the experiment
+    outside: Any = None  # what a player of vehicles from outside needs to know
 
 
 @struct.dataclass(frozen=True, kw_only=True)
@@ -227,6 +246,7 @@ class State:
     lights: Lights
     egos: Egos
     script: Progress | None = None  # None: there is none
+    outside: Outside | None = None  # None: there are none
 
 
 @struct.dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from limsim_jax.cli.common import window
+from limsim_jax.cli.scenarios import is_scenario, sweep_scenarios
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
 ExperimentArgument = Annotated[
     str,
     typer.Argument(
-        metavar="EXPERIMENT", help="Experiment file (.toml or .sumocfg), or the name of a bundled one."
+        metavar="EXPERIMENT",
+        help="Experiment file (.toml, .sumocfg, .xosc, or a folder of .xosc), or the name of a bundled one.",
     ),
 ]
 ResultsArgument = Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder that a sweep has written.")]
@@ -54,7 +56,13 @@ def add_commands(app: typer.Typer) -> None:
 
 def sweep(
     experiment: ExperimentArgument,
-    seeds: Annotated[int, typer.Option(help="How many worlds of each scenario: seeds 0, 1, 2, ...")] = 100,
+    seeds: Annotated[
+        int | None,
+        typer.Option(
+            help="How many worlds of each scenario: seeds 0, 1, 2, ...; of a .xosc so many of its variants."
+            "  [default: 100; of a .xosc all]"
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Where results go.  [default: results/EXPERIMENT]"),
@@ -98,8 +106,19 @@ def sweep(
         int | None, typer.Option(min=1, help="With SUMO: how many vehicles are drawn.  [default: 1]")
     ] = None,
     horizon: Annotated[
-        float | None, typer.Option(help="With SUMO: s that an ego has for its trip.  [default: 180]")
+        float | None,
+        typer.Option(help="With SUMO: s that an ego has for its trip.  [default: 180]  Of a .xosc: at most."),
     ] = None,
+    root: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Of a .xosc: catalogs may lie in this folder.")
+    ] = None,
+    lenient: Annotated[
+        bool, typer.Option("--lenient", help="Of a .xosc: list what is not supported, and leave it out.")
+    ] = False,
+    at_once: Annotated[
+        bool,
+        typer.Option("--at-once", help="Of a .xosc: the policy drives from the start."),
+    ] = False,
     drivers: Annotated[
         Literal["sumo", "ours"] | None,
         typer.Option(help="With SUMO: what drives the other vehicles.  [default: sumo]"),
@@ -119,6 +138,18 @@ def sweep(
     from limsim_jax.sweeps.experiment import read_experiments
 
     part, stop = _shard(shard), _until(until_ci)
+    if is_scenario(experiment):
+        if engine != "limsim" or workers is not None or stop is not None:
+            raise typer.BadParameter("not with --engine, --workers or --until-ci", param_hint="EXPERIMENT")
+        sweep_scenarios(
+            Path(experiment), policy, out=out, variants=seeds, override=map_file, chunk=chunk, shard=part,
+            on_error=on_error, fresh=fresh, horizon=horizon, root=root, lenient=lenient, controlled=at_once,
+        )  # fmt: skip
+        return
+    for name, value in {"--root": root, "--lenient": lenient, "--at-once": at_once}.items():
+        if value:
+            raise typer.BadParameter("only of a .xosc", param_hint=name)
+    seeds = 100 if seeds is None else seeds
     if not 1 <= seeds <= 2**31:
         raise typer.BadParameter(f"{seeds}; between 1 and 2^31", param_hint="--seeds")
     if chunk is not None and chunk < 1:

@@ -1,13 +1,17 @@
-"""Commands about scenarios of other tools: check."""
+"""Commands about scenarios of other tools: check, and sweeps over their variants."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from limsim_jax.cli.common import JsonOption, write_json
+from limsim_jax.cli.common import JsonOption, table, write_json
+
+if TYPE_CHECKING:
+    from limsim_jax.policies.base import PolicyLike
+    from limsim_jax.sweeps.runner import Progress
 
 RootOption = Annotated[
     Path | None,
@@ -53,3 +57,104 @@ def check(
             },
         )
     print(found)
+
+
+def is_scenario(name: str) -> bool:
+    """Whether an argument names a scenario, or a folder of them."""
+    path = Path(name)
+    return path.suffix.lower() == ".xosc" or (path.is_dir() and any(path.glob("*.xosc")))
+
+
+def files_of(path: Path) -> list[Path]:
+    """The files to run: of a folder its distributions, or its scenarios if it has none."""
+    if not path.is_dir():
+        return [path]
+    files = sorted(path.glob("*.xosc"))
+    varied = [x for x in files if b"ParameterValueDistribution" in x.read_bytes()]
+    return varied or files
+
+
+def policy_named(name: str | None) -> PolicyLike | None:
+    """The policy of this name; None and "script": the ego keeps to its script."""
+    from limsim_jax.sweeps.build import policy_of
+    from limsim_jax.sweeps.experiment import EgoTable, ExperimentFile
+
+    if name is None or name == "script":
+        return None
+    return policy_of(ExperimentFile(name="policy", map="-", horizon=1.0, ego=(EgoTable(policy=name),)))
+
+
+def sweep_scenarios(
+    path: Path,
+    policy: str | None,
+    *,
+    out: Path | None,
+    variants: int | None,
+    override: str | None,
+    chunk: int | None,
+    shard: tuple[int, int] | None,
+    on_error: Literal["record", "stop"],
+    fresh: bool,
+    horizon: float | None,
+    root: Path | None,
+    lenient: bool,
+    controlled: bool,
+) -> None:
+    """Run all variants of a scenario, or of those in a folder."""
+    import time
+
+    from limsim_jax.api.progress import progress_bar
+    from limsim_jax.scenarios.openscenario.episodes import HORIZON, episodes_of
+    from limsim_jax.scenarios.openscenario.scenario import openscenario
+    from limsim_jax.sweeps import runner
+
+    length = HORIZON if horizon is None else horizon
+    if not 0 < length < 1e5:
+        raise typer.BadParameter(f"{length:g} s; it has to be above 0", param_hint="--horizon")
+    driver = policy_named(policy)
+    options: dict[str, Any] = {"horizon": length, "chunk": chunk, "controlled": controlled}
+    if policy is not None and policy != "script":
+        options["policy_label"] = policy.replace(":", "-").replace(".", "-")
+    made = []
+    for file in files_of(path):
+        found = openscenario(file, lenient=lenient, root=root)
+        for note in found.notes:
+            print(f"{found.name}: {note}")
+        made += episodes_of(found, driver, override=override, variants=variants, **options)
+    folder = Path("results") / path.stem if out is None else out
+    begin, ran = time.perf_counter(), 0
+    with progress_bar() as show:
+
+        def tell(now: Progress) -> None:
+            if show is not None:
+                show(now)
+
+        for one in made:
+            summary = runner.sweep(
+                [one], range(len(one.which)), folder, shard=shard, progress=tell, on_error=on_error,
+                fresh=fresh,
+            )  # fmt: skip
+            ran += sum(part.ran for part in summary.parts)
+    print(f"{ran} worlds run in {time.perf_counter() - begin:.0f} s, results in {folder}")
+    if shard is None:
+        print_outcome(folder)
+
+
+def print_outcome(folder: Path) -> None:
+    """Print how the variants of each scenario ended."""
+    import numpy as np
+
+    from limsim_jax.sweeps.store import open_results
+
+    opened = open_results(folder)
+    lines = []
+    for scenario, policy in opened.provenance:
+        rows = opened.episodes
+        mine = np.asarray(rows.column("scenario")) == scenario
+        mine &= np.asarray(rows.column("policy")) == policy
+        if "passed" not in rows.column_names:
+            continue
+        passed, contacts = (np.asarray(rows.column(x))[mine] for x in ("passed", "contacts"))
+        said = f"{int(passed.sum())} of {len(passed)} passed, {int((contacts > 0).sum())} collided"
+        lines.append((f"{scenario} / {policy}", said))
+    table(lines)

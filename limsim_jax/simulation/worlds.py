@@ -72,6 +72,7 @@ class Worlds:
       devices: all local devices by default.
       names: all that the sampler and the run depend on beside shapes. Programs are kept on disk by these
         names; where one is None, they are not.
+      scenarios: scenarios of some seeds, `[B, ...]`, made on the host; in place of those of the sampler.
     """
 
     def __init__(
@@ -83,6 +84,7 @@ class Worlds:
         chunk: int = 64,
         devices: Sequence[Any] | None = None,
         names: tuple[str | None, str | None] = (None, None),
+        scenarios: Callable[[Sequence[int]], Scenario] | None = None,
     ) -> None:
         devices = list(jax.local_devices() if devices is None else devices)
         if chunk < 1:
@@ -92,8 +94,13 @@ class Worlds:
         self.lane_map = jax.device_put(lane_map, NamedSharding(self.mesh, PartitionSpec()))
         self.rollout = run
 
-        def start(lane_map: LaneMap, seed: Int[Array, ""]) -> Started:
-            return started(run, lane_map, sampler, seed)
+        def start(lane_map: LaneMap, world: Any) -> Started:
+            if scenarios is None:
+                return started(run, lane_map, sampler, world)
+            seed, scenario = world
+            return started(run, lane_map, lambda _: scenario, seed)
+
+        self._scenarios = scenarios
 
         def advance(shared: tuple[LaneMap, Int[Array, ""]], world: Started) -> tuple[Started, Result]:
             lane_map, decisions = shared
@@ -113,7 +120,7 @@ class Worlds:
         if self._advance is not None:
             return self
         enable_compilation_cache()
-        seeds = jnp.zeros(self.chunk, jnp.int32)
+        seeds = self._inputs(np.zeros(self.chunk, np.int32))
 
         aside = contextlib.nullcontext() if self._advance_name is None else without_compilation_cache()
         with ThreadPoolExecutor(1) as pool, no_garbage_collection(), aside:
@@ -141,7 +148,13 @@ class Worlds:
             raise ValueError(f"{len(seeds)} seeds at once; at most {self.chunk}")
         self.compile()
         padded = np.array([*seeds, *[seeds[-1]] * (self.chunk - len(seeds))], np.int32)
-        return self._start(self.lane_map, padded)
+        return self._start(self.lane_map, self._inputs(padded))
+
+    def _inputs(self, seeds: Any) -> Any:
+        """What the worlds of some seeds start from."""
+        if self._scenarios is None:
+            return jnp.asarray(seeds)
+        return jnp.asarray(seeds), self._scenarios(seeds.tolist())
 
     def advance(self, worlds: Started, decisions: int) -> tuple[Started, Result]:
         """A chunk some decisions later, on the devices; `worlds` themselves are used up.

@@ -98,7 +98,7 @@ def step_free(config: Config, lane_map: LaneMap, limits: Limits, state: State, c
     most = limits.lateral_acceleration / jnp.maximum(v0 * v0, 0.1)
     dx, dy, turn = _arc(egos.heading, distance, jnp.clip(bend, -most, most), wheelbase)
     x, y, heading = egos.x + dx, egos.y + dy, wrap_angle(egos.heading + turn)
-    place = _find_lane(lane_map, state, x, y, heading, distance)
+    place = find_lane(lane_map, state, x, y, heading, distance)
 
     moves = egos.free & state.active[egos.slot]
 
@@ -157,7 +157,9 @@ def _arc(heading: Array, distance: Array, bend: Array, wheelbase: Array) -> tupl
 # ---- which lane
 
 
-class _Place(NamedTuple):
+class Place(NamedTuple):
+    """Where egos are on lanes."""
+
     lane: Int[Array, " E"]  # of the front bumper
     previous: Int[Array, " E"]
     s: Float[Array, " E"]
@@ -165,9 +167,7 @@ class _Place(NamedTuple):
     side: Int[Array, " E"]
 
 
-def _find_lane(
-    lane_map: LaneMap, state: State, x: Array, y: Array, heading: Array, distance: Array
-) -> _Place:
+def find_lane(lane_map: LaneMap, state: State, x: Array, y: Array, heading: Array, distance: Array) -> Place:
     """Places of egos now, `distance` m after those of `state`."""
     slot = state.egos.slot
     length, breadth = state.shape.length[slot], state.shape.width[slot]
@@ -205,7 +205,7 @@ def _find_lane(
     turned = wrap_angle(heading - along)
     half = (jnp.abs(jnp.sin(turned)) * length + jnp.abs(jnp.cos(turned)) * breadth) / 2
     over_line = half + jnp.abs(d) - width(lane_map, lane, s) / 2 > _OVER_LINE
-    return _Place(
+    return Place(
         lane=jnp.where(over, onto, lane),
         previous=jnp.where(over, lane, previous),
         s=jnp.where(over, to_go, front),
@@ -329,9 +329,14 @@ def with_free(moved: State, free: State) -> State:
 
 
 def overlay_boxes(state: State, box: Float[Array, "N 5"]) -> Float[Array, "N 5"]:
-    """Boxes with those of free egos where they are in the plane; m, rad."""
+    """Boxes with those of free egos and of vehicles from outside where they are in the plane; m, rad."""
     egos = state.egos
     place = [at_slots(egos, v, box[:, k], egos.free) for k, v in enumerate((egos.x, egos.y, egos.heading))]
+    outside = state.outside
+    if outside is not None:
+        mine = replace(egos, slot=outside.slot, free=outside.held & outside.there & (outside.slot >= 0))
+        poses = outside.x, outside.y, outside.heading
+        place = [at_slots(mine, v, place[k], mine.free) for k, v in enumerate(poses)]
     return jnp.concatenate([jnp.stack(place, -1), box[:, 3:]], -1)
 
 

@@ -51,6 +51,7 @@ from limsim_jax.traffic.neighbors import (
     place_of,
     sort_vehicles,
 )
+from limsim_jax.traffic.outside import Player, is_held, put
 from limsim_jax.traffic.parameters import DRIVING, LANE_CHANGES
 from limsim_jax.traffic.right_of_way import approaches_ahead, give_way
 from limsim_jax.traffic.script import (
@@ -79,6 +80,7 @@ class Traffic:
     after_collision: AfterCollision = "stop"
     look_for_contacts: Literal["step", "decision"] = "step"  # how often bodies are compared
     limits: Limits = field(default_factory=Limits)  # of free egos
+    player: Player | None = None  # moves vehicles from outside, `State.outside`
 
 
 class Tick(NamedTuple):
@@ -155,6 +157,8 @@ def decide(
     if actions is not None:
         state, asked, ordered = ordered_change(lane_map, actions, state)
         choice = choice._replace(side=jnp.where(ordered, asked, choice.side))
+    if state.outside is not None:
+        choice = choice._replace(side=jnp.where(is_held(state), 0, choice.side))
     choice = computed_once(choice)
     if traffic.lane_changes or command.meta is not None or actions is not None:
         state = start(lane_map, state, choice)
@@ -364,6 +368,7 @@ def drive(
         state = enter(config, lane_map, schedule, state)
     script = None if schedule is None else schedule.script
     actions = None if script is None or state.script is None else script.actions
+    told = None if schedule is None else schedule.outside
     dry = state.driver
     if actions is not None:
         state = begin(config, lane_map, actions, state)
@@ -383,7 +388,7 @@ def drive(
         state, x = carry
         state = replace(state, **fixed)
         state, dx, left, box, off = _step(
-            config, traffic, lane_map, state, decision, x, command, broken, free, actions
+            config, traffic, lane_map, state, decision, x, command, broken, free, actions, told
         )
         x = x + dx
         if record is None:
@@ -415,6 +420,7 @@ def _step(
     broken: Bool[Array, " E"],
     may_be_free: bool,
     actions: Actions | None,
+    told: Any,
 ) -> tuple[
     State, Float[Array, " N"], Bool[Array, " N"], Float[Array, "N 5"] | None, Bool[Array, " N"] | None
 ]:
@@ -423,7 +429,8 @@ def _step(
     Returns the state, metres travelled, and whether vehicles have left. If contacts are looked for, also the
     bodies, and whether they are off the road.
     """
-    egos = state.egos
+    egos, before = state.egos, state
+    outside = None if traffic.player is None else traffic.player(config, told, state)
     if actions is None:
         a = accelerations(traffic.model, state, decision, x)
     else:
@@ -457,7 +464,14 @@ def _step(
         moved = with_free(moved, free)
         gone = at_slots(egos, arrived(lane_map, moved), jnp.zeros_like(left), egos.free)
         moved, left = without(moved, gone), left | gone
-    state = replace(moved, step=state.step + 1)
+    if outside is not None:
+        held = is_held(replace(before, outside=outside))
+        moved = put(config, lane_map, before, moved, outside)
+        dx, left = jnp.where(held, moved.distance - before.distance, dx), left & ~held
+    state = replace(moved, step=before.step + 1)
+    if outside is not None:
+        box = computed_once(boxes(lane_map, state))
+        state = replace(state, outside=replace(outside, box=box[outside.slot]))
     if traffic.look_for_contacts != "step":
         return state, dx, left, None, None
     box = computed_once(boxes(lane_map, state))

@@ -8,7 +8,7 @@ import pytest
 import xosc
 from paths import REPO, SHARED, needs_shared
 
-from limsim_jax.scenarios.openscenario.coverage import COVERAGE
+from limsim_jax.scenarios.openscenario.coverage import COVERAGE, page
 from limsim_jax.scenarios.openscenario.scenario import openscenario
 from limsim_jax.scenarios.openscenario.source import OpenScenarioError
 from limsim_jax.scenarios.openscenario.storyboard import (
@@ -520,6 +520,19 @@ def test_every_shared_file_reads():
 
 
 # --- the page
+
+
+def test_tests_of_the_table_exist():
+    here = Path(__file__).parent
+    for name, support in COVERAGE.items():
+        file, _, test = support.test.partition("::")
+        path = here / file
+        assert path.exists(), name
+        assert f"def {test}(" in path.read_text(), f"{name}: no {test} in {file}"
+
+
+def test_the_page_is_of_this_table():
+    assert (REPO / "docs" / "reference" / "openscenario.md").read_text() == page()
 
 
 def test_the_table_knows_what_readers_ask_for():

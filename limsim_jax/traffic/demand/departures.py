@@ -69,6 +69,8 @@ def enter(config: Config, lane_map: LaneMap, schedule: Schedule, state: State) -
     # the free slot of rank r takes the entering vehicle of rank r
     slot = jnp.arange(n, dtype=jnp.int32)
     free = ~state.active & ~(slot[:, None] == state.egos.slot[None]).any(1)
+    if state.outside is not None:
+        free &= ~(slot[:, None] == state.outside.slot[None]).any(1)
     slot_rank, rank = (jnp.cumsum(x, dtype=jnp.int32) for x in (free, ready))
     enters = ready & (rank <= slot_rank[-1])
     match = free[:, None] & enters[None] & (slot_rank[:, None] == rank[None])  # [N, P]
