@@ -139,7 +139,7 @@ class Progress:
 
 @struct.dataclass(frozen=True, kw_only=True)
 class Outside:
-    """Vehicles that something outside of the traffic moves, `K` of them, as entities of a scenario."""
+    """Vehicles that something outside of the traffic moves, `K` of them."""
 
     slot: Int[Array, " K"]  # -1: none
     held: Bool[Array, " K"]  # moved from outside now; otherwise by the traffic or a policy

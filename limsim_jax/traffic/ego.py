@@ -329,7 +329,10 @@ def with_free(moved: State, free: State) -> State:
 
 
 def overlay_boxes(state: State, box: Float[Array, "N 5"]) -> Float[Array, "N 5"]:
-    """Boxes with those of free egos and of vehicles from outside where they are in the plane; m, rad."""
+    """Boxes with bodies in the plane where they are there; m, rad.
+
+    Those are free egos and vehicles from outside.
+    """
     egos = state.egos
     place = [at_slots(egos, v, box[:, k], egos.free) for k, v in enumerate((egos.x, egos.y, egos.heading))]
     outside = state.outside

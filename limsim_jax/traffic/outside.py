@@ -23,7 +23,7 @@ Player = Callable[[Config, Any, State], Outside]
 
 
 def rows(outside: Outside) -> Egos:
-    """Vehicles from outside as rows of `Egos`, by which lanes are looked up."""
+    """Vehicles from outside as rows of `Egos`, to look up their lanes."""
     nothing = jnp.zeros_like(outside.x)
     return Egos(
         slot=outside.slot,

@@ -16,6 +16,8 @@ from limsim_jax.scenarios.openscenario.scenario import openscenario
 
 CM = 0.01
 
+pytestmark = pytest.mark.engine
+
 
 def when(seconds=1.0):
     return xosc.trigger(xosc.time_condition(seconds, edge="rising"))
@@ -538,7 +540,8 @@ def test_controller(tmp_path_factory):
     pose = np.zeros((PIECE, count, 3), np.float32)
     pose[:, 0, 0] = 100 + 5 * k  # where a policy would have put it
     flat = np.zeros((PIECE, count), np.float32)
-    after = run(board, memory, 12, 0.05, Bodies(pose, flat + 7, flat, flat == 0))
+    bodies = Bodies(*as_device((pose, flat + 7, flat, flat == 0)))
+    after = run(board, memory, 12, 0.05, bodies)
     held = after.held[:, :2].tolist()
     assert [x for x, _ in held] == [True] * 2 + [False] * 4 + [True] * 2 + [False] * 4
     assert all(x for _, x in held)

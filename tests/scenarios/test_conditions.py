@@ -1,6 +1,7 @@
 """Conditions of OpenSCENARIO, at the exact step, and the order of the storyboard."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import xosc
 from osc_worlds import play
 
 DT = 0.05
+
+pytestmark = pytest.mark.engine
 COUNT = '<VariableDeclaration name="n" variableType="double" value="0"/>'
 ADD = (
     '<GlobalAction><VariableAction variableRef="n"><ModifyAction><Rule><AddValue value="1"/></Rule>'
@@ -40,7 +43,7 @@ def folder(tmp_path_factory):
 
 
 def first(times):
-    return times[0] if times else None
+    return times[0] if times else math.inf
 
 
 def step_after(exact, *, strict=False):
@@ -105,7 +108,7 @@ def b_at(s, v, lane=-1):
     return xosc.start("B", xosc.lane(lane, s), v)
 
 
-def with_b(s=150, v=10, lane=-1):
+def with_b(s=150, v=10, lane=-1) -> dict[str, Any]:
     init = xosc.start("Ego", xosc.lane(-1, 50), 20) + b_at(s, v, lane)
     return {"init": init, "entities": xosc.entity("B")}
 
@@ -269,7 +272,7 @@ def test_collision(folder):
 
 def test_angle(folder):
     init = xosc.start("Ego", xosc.lane(-1, 50), 20) + b_at(900, 20, 1)
-    setup = {"init": init, "entities": xosc.entity("B")}
+    setup: dict[str, Any] = {"init": init, "entities": xosc.entity("B")}
     relative = '<RelativeAngleCondition entityRef="B" angleType="heading" angle="{}" angleTolerance="0.1"/>'
     assert fires(folder, xosc.by_entity(relative.format(3.14)), **setup) == [0]
     assert fires(folder, xosc.by_entity(relative.format(0)), **setup) == []

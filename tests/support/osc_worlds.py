@@ -73,7 +73,7 @@ def run(board: Any, memory: Any, steps: int, dt: float, bodies: Any = None) -> A
         if bodies is None:
             count = memory.v.shape[0]
             flat = np.zeros((PIECE, count), np.float32)
-            some = Bodies(np.zeros((PIECE, count, 3), np.float32), flat, flat, flat > 0)
+            some = Bodies(*as_device((np.zeros((PIECE, count, 3), np.float32), flat, flat, flat > 0)))
         else:
             some = jax.tree.map(lambda x: x[k : k + PIECE], bodies)  # noqa: B023
         memory, after = program(board, memory, some)

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.map import Map, load_map
 from limsim_jax.maps.network import MapError
 from limsim_jax.maps.xml import file_hash
@@ -138,7 +137,7 @@ class ScenarioEpisodes(Episodes):
         self.chunk = min(_CHUNK, max(len(self.which), 1)) if chunk is None else chunk
         self.world_bytes = 0
         self.worlds = Worlds(
-            self.rollout, town.lanes, _no_sampler, chunk=self.chunk, scenarios=self.worlds_of
+            self.rollout, self.lane_map, _no_sampler, chunk=self.chunk, scenarios=self.worlds_of
         )
         self.chunk = self.worlds.chunk
 
@@ -146,11 +145,6 @@ class ScenarioEpisodes(Episodes):
     def egos(self) -> int:
         """Vehicles under test."""
         return 1
-
-    @property
-    def lane_map(self) -> LaneMap:
-        """The map on the device."""
-        return self.town.lanes
 
     def _sizes(self, dt: float) -> Sizes:
         """Sizes that hold a sample of the variants."""

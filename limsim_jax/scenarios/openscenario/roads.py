@@ -1,4 +1,4 @@
-"""Places of a scenario on a map, and the corridors of its entities.
+"""Places of a scenario on a map, and corridors of its entities.
 
 A corridor is a chain of lanes, one after the other, with the lanes beside it: its base line is the middle of
 the chain. An entity is `s` m along the base line and `t` m to its left. All in float64, in the coordinates
