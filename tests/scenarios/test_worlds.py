@@ -1,12 +1,77 @@
-"""Scenarios on their maps."""
+"""Scenarios in the engine: entities beside an ego that a policy drives, and variants in a sweep."""
 
+import numpy as np
 import pytest
 import xosc
-from osc_worlds import road
+from osc_worlds import play, road
 
+from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.scenarios.openscenario.episodes import episodes_of
 from limsim_jax.scenarios.openscenario.scenario import openscenario
 from limsim_jax.scenarios.openscenario.source import OpenScenarioError
+from limsim_jax.sweeps import runner
+from limsim_jax.sweeps.store import open_results
+
+ACTIVATE = (
+    '<PrivateAction><ControllerAction><ActivateControllerAction longitudinal="true" lateral="true"/>'
+    "</ControllerAction></PrivateAction>"
+)
+CHANGE = (
+    "<PrivateAction><LateralAction><LaneChangeAction>"
+    '<LaneChangeActionDynamics dynamicsShape="sinusoidal" dynamicsDimension="time" value="3"/>'
+    '<LaneChangeTarget><AbsoluteTargetLane value="-1"/></LaneChangeTarget>'
+    "</LaneChangeAction></LateralAction></PrivateAction>"
+)
+
+
+def cut_in(folder):
+    """B drives 12 m/s in the lane beside and changes into that of the ego at 2 s; the end is at 8 s."""
+    (folder / "road.xodr").write_text(road())
+    parameters = '<ParameterDeclaration name="gap" parameterType="double" value="40"/>'
+    story = xosc.act(
+        xosc.event("on", ACTIVATE, xosc.trigger(xosc.time_condition(1))), name="activates"
+    ) + xosc.act(xosc.event("cut", CHANGE, xosc.trigger(xosc.time_condition(2))), ("B",), name="cutsIn")
+    text = xosc.scenario(
+        xosc.entity("Ego") + xosc.entity("B"),
+        xosc.start("Ego", xosc.lane(-1, 50), 20) + xosc.start("B", xosc.lane(-2, "${50 + $gap}"), 12),
+        story,
+        xosc.trigger(xosc.time_condition(8), tag="StopTrigger"),
+        parameters=parameters,
+    )
+    xosc.write(folder, text, "cut.xosc")
+    axis = "".join(f'<Element value="{x}"/>' for x in (8, 40, 500))
+    axis = (
+        '<DeterministicSingleParameterDistribution parameterName="gap"><DistributionSet>'
+        f"{axis}</DistributionSet></DeterministicSingleParameterDistribution>"
+    )
+    many = xosc.distribution("cut.xosc", f"<Deterministic>{axis}</Deterministic>")
+    return text, xosc.write(folder, many, "cuts.xosc")
+
+
+@pytest.mark.engine
+def test_variants_are_worlds_of_a_sweep(tmp_path):
+    text, path = cut_in(tmp_path)
+    (episodes,) = episodes_of(openscenario(path), LikeTraffic(), horizon=10.0, dt=0.05, decision_every=10)
+    out = tmp_path / "results"
+    summary = runner.sweep([episodes], range(3), out)
+    assert summary.parts[0].ran == 3
+    assert runner.sweep([episodes], range(3), out).parts[0].ran == 0  # they are on disk
+    rows = open_results(out).episodes.to_pydict()
+    assert rows["parameter_gap"] == [8, 40, 500]
+    assert rows["scenario_ended"] == [1, 1, 1]
+    assert rows["passed"][1:] == [1, 1]
+
+    # B is where it is without traffic, and the ego is held until its controller is active
+    trace = episodes.worlds.replay(episodes.worlds.start([1])).trace
+    alone = play(tmp_path, text, 10.0)
+    b, h = alone["B"], alone["B"]["h"]
+    x0 = float(np.asarray(episodes.lane_map.origin)[0])
+    box, steps = np.asarray(trace.box)[0], np.arange(140)
+    middle = b["x"][1 + steps] + 1.4 * np.cos(h[1 + steps])
+    np.testing.assert_allclose(box[steps, 1, 0] + x0, middle, atol=0.01)
+    v = np.asarray(trace.v)[0, :, 0]
+    np.testing.assert_allclose(v[:19], 20, atol=1e-4)
+    assert v[120] < 15  # it brakes for B, which is slower
 
 
 def test_maps_are_found(tmp_path):
