@@ -87,6 +87,7 @@ from limsim_jax.scenarios.openscenario.storyboard import (
     Trigger,
     ValueAction,
     VisibilityAction,
+    changed,
 )
 
 SHAPES = {"step": Shape.STEP, "linear": Shape.LINEAR, "sinusoidal": Shape.SINUSOIDAL, "cubic": Shape.CUBIC}
@@ -746,14 +747,6 @@ class Builder:
             over=np.bool_(False),
         )
         return Memory(**fields)
-
-
-def changed(value: Value, does: ValueAction) -> Value:
-    """A parameter or variable after an action."""
-    if does.how == "set":
-        return does.value
-    number, by = float(value), float(does.value)
-    return number + by if does.how == "add" else number * by
 
 
 def _dynamics(shape: str, dimension: str, value: float) -> dict[str, Any]:

@@ -669,3 +669,11 @@ def ego_of(entities: tuple[Entity, ...]) -> str | None:
     named += [x for x in vehicles if x.controlled]
     found = named or vehicles
     return found[0].name if found else None
+
+
+def changed(value: Value, does: ValueAction) -> Value:
+    """A parameter or variable after an action."""
+    if does.how == "set":
+        return does.value
+    number, by = float(value), float(does.value)
+    return number + by if does.how == "add" else number * by
