@@ -1,5 +1,7 @@
 from .api.env import Env as Env
 from .api.env import RouteReward as RouteReward
+from .api.estimate import Estimate as Estimate
+from .api.estimate import estimate as estimate
 from .api.experiment import Action as Action
 from .api.experiment import Ego as Ego
 from .api.experiment import Experiment as Experiment
@@ -16,6 +18,8 @@ from .api.results import open_results as open_results
 from .api.sensed import Film as Film
 from .api.sensed import Sensed as Sensed
 from .api.sweep import sweep as sweep
+from .api.triage import sensitivity as sensitivity
+from .api.triage import triage as triage
 from .api.world import World as World
 from .bridges import carla as carla
 from .bridges.formats.export import export as export

@@ -55,3 +55,33 @@ def progress_bar(shown: bool = True) -> Iterator[Callable[[Progress], None] | No
                 print(f"{name}: compiling, which takes up to a minute the first time", flush=True)
 
         yield show
+
+
+@contextlib.contextmanager
+def count_bar(shown: bool, name: str) -> Iterator[Callable[[int, int], None] | None]:
+    """A bar of worlds that have run, of the most that may; without a terminal, a line every fifth of them."""
+    if not shown:
+        yield None
+        return
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    console = Console()
+    live = console.is_terminal or console.is_jupyter
+    with rich_progress.Progress(
+        rich_progress.TextColumn("{task.description:<28}"),
+        rich_progress.BarColumn(bar_width=24),
+        rich_progress.TextColumn("{task.completed:.0f} of at most {task.total:.0f} worlds"),
+        console=console,
+        disable=not live,
+    ) as bar:
+        task, told = bar.add_task(name, total=1), -1
+
+        def show(done: int, most: int) -> None:
+            nonlocal told
+            bar.update(task, completed=done, total=most)
+            if not live and 5 * done // most > told:
+                told = 5 * done // most
+                print(f"{name}: {done} of at most {most} worlds", flush=True)
+
+        yield show

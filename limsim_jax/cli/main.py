@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from limsim_jax import __version__
-from limsim_jax.cli import fitting, instructions, results, scenarios
+from limsim_jax.cli import fitting, instructions, rare, results, scenarios
 from limsim_jax.cli.bench import bench_app
 from limsim_jax.cli.maps import map_app
 from limsim_jax.cli.run import run
@@ -33,6 +33,7 @@ app.add_typer(bench_app, name="bench")
 app.add_typer(serve_app, name="serve")
 app.command()(run)
 results.add_commands(app)
+rare.add_commands(app)
 fitting.add_commands(app)
 scenarios.add_commands(app)
 instructions.add_commands(app)

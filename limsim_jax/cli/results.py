@@ -123,6 +123,25 @@ def sweep(
         Literal["sumo", "ours"] | None,
         typer.Option(help="With SUMO: what drives the other vehicles.  [default: sumo]"),
     ] = None,
+    event: Annotated[
+        str | None,
+        typer.Option(
+            "--estimate",
+            metavar="EVENT",
+            help="Estimate the probability of a rare event instead: contact, fault, or as min_ttc<1.",
+        ),
+    ] = None,
+    method: Annotated[
+        Literal["subset", "crude", "cross-entropy"] | None,
+        typer.Option(help="With --estimate: how.  [default: subset]"),
+    ] = None,
+    budget: Annotated[
+        int | None, typer.Option(help="With --estimate: worlds in all, at most.  [default: 5000]")
+    ] = None,
+    least: Annotated[
+        float | None,
+        typer.Option(help="With --estimate: probability that is looked for, at least.  [default: 1e-4]"),
+    ] = None,
     on_error: Annotated[
         Literal["record", "stop"],
         typer.Option(help="An episode in which the policy fails is recorded as failed, or stops the sweep."),
@@ -131,6 +150,9 @@ def sweep(
         bool, typer.Option("--fresh", help="Remove what is there of this experiment, and start anew.")
     ] = False,
     html: Annotated[bool, typer.Option("--report/--no-report", help="Write the report at the end.")] = True,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="With --estimate: write the table as JSON.")
+    ] = None,
 ) -> None:
     """Run an experiment with many seeds; go on where an earlier run has stopped.
 
@@ -158,6 +180,10 @@ def sweep(
         raise typer.BadParameter(f"{workers}; at least 1", param_hint="--workers")
     if fresh and part is not None:
         raise typer.BadParameter("it would remove the results of other shards", param_hint="--fresh")
+    in_estimates = {"--method": method, "--budget": budget, "--least": least, "--json": json_file}
+    for name, value in in_estimates.items():
+        if value is not None and event is None:
+            raise typer.BadParameter("only with --estimate", param_hint=name)
     in_sumo = {"--ego": ego, "--egos": egos, "--horizon": horizon, "--drivers": drivers}
     if ego is not None and egos is not None:
         raise typer.BadParameter("--ego names them; --egos draws so many", param_hint="--egos")
@@ -170,6 +196,18 @@ def sweep(
                 raise typer.BadParameter("only with --engine sumo", param_hint=name)
         experiments = read_experiments(experiment, map_file=map_file, policy=policy)
     folder = Path("results") / Path(experiment).stem if out is None else out
+    if event is not None:
+        alone = {"--shard": shard, "--until-ci": until_ci, "--workers": workers}
+        alone["--engine sumo"] = None if engine == "limsim" else engine
+        for name, value in alone.items():
+            if value is not None:
+                raise typer.BadParameter(
+                    f"an estimate is one run of its own, without {name}", param_hint="--estimate"
+                )
+        from limsim_jax.cli.rare import estimate
+
+        folder = folder.with_name(f"{folder.name}-estimate") if out is None else out
+        return estimate(experiments, event, folder, method, budget, least, chunk, fresh, html, json_file)
     begin = time.perf_counter()
 
     from limsim_jax.api.progress import progress_bar

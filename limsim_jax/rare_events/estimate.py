@@ -60,6 +60,7 @@ class RareEvent:
       levels: of the runs, on average.
       points: `[M, D]` standard normals within the event, of all runs.
       weights: `[M]` of these points; they add up to 1.
+      run: `[M]` of which run they are.
       notes: what to know about the figures.
       level: of confidence.
     """
@@ -71,6 +72,7 @@ class RareEvent:
     levels: float
     points: Floats = field(repr=False)
     weights: Floats = field(repr=False)
+    run: NDArray[np.int64] = field(repr=False)
     notes: tuple[str, ...] = ()
     level: float = 0.95
 
@@ -115,7 +117,7 @@ def rare_event(
     Raises:
       ValueError: a number out of range, or a limit state of another shape or with NaN; one line.
     """
-    moments = _check(dim, method, samples, runs, least, born, level)
+    moments = check_settings(dim, method, samples, runs, least, born, level)
     ask = _Meter(f, paths=moments is not None)
     if method == "auto":
         pilot = _lockstep([crude(np.random.default_rng([seed, _PILOT]), dim, samples)], ask)
@@ -141,6 +143,7 @@ def rare_event(
         levels=float(np.mean([run.levels for run in found])),
         points=points,
         weights=weights / weights.sum() if weights.any() else np.zeros(len(points)),
+        run=np.repeat(np.arange(runs), [len(run.points) for run in found]),
         notes=notes,
         level=level,
     )
@@ -235,10 +238,13 @@ def _lockstep(samplers: Sequence[Sampler], ask: Callable[[Floats], Floats]) -> l
     return [found[k] for k in range(len(samplers))]
 
 
-def _check(
+def check_settings(
     dim: int, method: str, samples: int, runs: int, least: float, born: ArrayLike | None, level: float
 ) -> NDArray[np.int64] | None:
-    """Refuse what makes no sense; the moments of the numbers for splitting."""
+    """Refuse settings that make no sense; the moments of the numbers for splitting.
+
+    Raises `ValueError` with one line.
+    """
     check_level(level)
     if method not in get_args(Method):
         raise ValueError(f"method: '{method}'; known are {', '.join(get_args(Method))}")
@@ -267,4 +273,4 @@ def _check(
     return moments.astype(np.int64)
 
 
-__all__ = ["LEAST", "RUNS", "Method", "RareEvent", "rare_event", "summarise"]
+__all__ = ["LEAST", "RUNS", "Method", "RareEvent", "check_settings", "rare_event", "summarise"]

@@ -82,7 +82,7 @@ def crude(rng: np.random.Generator, dim: int, samples: int) -> Sampler:
 
 def subset(rng: np.random.Generator, dim: int, samples: int, least: float) -> Sampler:
     """Subset simulation: `samples` points per level, down to a probability of `least`."""
-    seeds = max(2, round(LEVEL * samples))
+    seeds = max(2, math.floor(LEVEL * samples))
     z = rng.standard_normal((samples, dim))
     g = yield z
     probability, calls, step, last = 1.0, samples, FIRST_STEP, math.inf

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int, Key
+from jaxtyping import Array, Int
 
 from limsim_jax.files import no_garbage_collection
 from limsim_jax.maps.lane_map import LaneMap
@@ -30,6 +30,9 @@ from limsim_jax.xla import (
     shared_program,
     without_compilation_cache,
 )
+
+Given = Callable[[Int[np.ndarray, " B"]], tuple[Any, Int[np.ndarray, " B"]]]
+"""Of seeds: what a sampler gets instead of keys, and the seeds of the policies."""
 
 
 def over_worlds(
@@ -73,18 +76,21 @@ class Worlds:
       names: all that the sampler and the run depend on beside shapes. Programs are kept on disk by these
         names; where one is None, they are not.
       scenarios: scenarios of some seeds, `[B, ...]`, made on the host; in place of those of the sampler.
+      given: what the sampler gets instead of a key: of seeds `[B]`, an array `[B, ...]` on the host, and the
+        seeds of the policies. None: keys are made from the seeds.
     """
 
     def __init__(
         self,
         run: Rollout,
         lane_map: LaneMap,
-        sampler: Callable[[Key[Array, ""]], Scenario],
+        sampler: Callable[[Any], Scenario],
         *,
         chunk: int = 64,
         devices: Sequence[Any] | None = None,
         names: tuple[str | None, str | None] = (None, None),
         scenarios: Callable[[Sequence[int]], Scenario] | None = None,
+        given: Given | None = None,
     ) -> None:
         devices = list(jax.local_devices() if devices is None else devices)
         if chunk < 1:
@@ -94,13 +100,16 @@ class Worlds:
         self.lane_map = jax.device_put(lane_map, NamedSharding(self.mesh, PartitionSpec()))
         self.rollout = run
 
-        def start(lane_map: LaneMap, world: Any) -> Started:
-            if scenarios is None:
-                return started(run, lane_map, sampler, world)
-            seed, scenario = world
-            return started(run, lane_map, lambda _: scenario, seed)
+        self._scenarios, self._given = scenarios, given
 
-        self._scenarios = scenarios
+        def start(lane_map: LaneMap, of: Any) -> Started:
+            if scenarios is not None:
+                seed, scenario = of
+                return started(run, lane_map, lambda _: scenario, seed)
+            if given is not None:
+                values, seed = of
+                return started(run, lane_map, lambda _: sampler(values), seed)
+            return started(run, lane_map, sampler, of)
 
         def advance(shared: tuple[LaneMap, Int[Array, ""]], world: Started) -> tuple[Started, Result]:
             lane_map, decisions = shared
@@ -152,9 +161,9 @@ class Worlds:
 
     def _inputs(self, seeds: Any) -> Any:
         """What the worlds of some seeds start from."""
-        if self._scenarios is None:
-            return jnp.asarray(seeds)
-        return jnp.asarray(seeds), self._scenarios(seeds.tolist())
+        if self._scenarios is not None:
+            return jnp.asarray(seeds), self._scenarios(seeds.tolist())
+        return jnp.asarray(seeds) if self._given is None else self._given(seeds)
 
     def advance(self, worlds: Started, decisions: int) -> tuple[Started, Result]:
         """A chunk some decisions later, on the devices; `worlds` themselves are used up.

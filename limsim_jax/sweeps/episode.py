@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import hashlib
 import importlib
@@ -34,9 +35,9 @@ from limsim_jax.policies.base import PolicyLike, check_policy, knows, policy_nam
 from limsim_jax.policies.host import failure_reasons
 from limsim_jax.policies.several import Several
 from limsim_jax.simulation.ending import Watch
-from limsim_jax.simulation.rollout import Result, Rollout, decision_key
+from limsim_jax.simulation.rollout import Result, Rollout, decision_key, world_key
 from limsim_jax.simulation.trace import trace
-from limsim_jax.simulation.worlds import Worlds
+from limsim_jax.simulation.worlds import Given, Worlds
 from limsim_jax.sweeps.build import (
     demand_of,
     doubts,
@@ -57,6 +58,7 @@ from limsim_jax.sweeps.store import Outcome
 from limsim_jax.sweeps.sumo import files_of, sumo_of
 from limsim_jax.traffic.car_following import CarFollowing
 from limsim_jax.traffic.demand import Flow, sample_scenario
+from limsim_jax.traffic.demand.draws import Layout, draw
 from limsim_jax.traffic.demand.sumo import with_schedule
 from limsim_jax.traffic.ego import with_rows
 from limsim_jax.traffic.vehicles import Population
@@ -182,6 +184,41 @@ class Episodes:
             self.experiment, chunk=self.chunk, town=self._as_read, name=policy_name(policy), **values
         )  # fmt: skip
 
+    @cached_property
+    def layout(self) -> Layout:
+        """The random numbers of a world, one by one.
+
+        Raises:
+          ExperimentError: they are no array: those of SUMO's demand.
+        """
+        if self._sumo is not None:
+            self._refuse("traffic.demand", "the random numbers of SUMO's demand are no array; count seeds")
+        return Layout.of(self._demand)
+
+    def from_numbers(self, given: Given) -> Episodes:
+        """The same worlds from arrays of random numbers: a seed is what `given` makes of it.
+
+        They run by the same program; only their start has one of its own. `given` returns values of
+        `layout`, `[B, D]`.
+        """
+        layout, found = self.layout, copy.copy(self)
+        found.__dict__.pop("_reruns", None)
+        started, run = self.worlds.names
+        found.worlds = Worlds(
+            self.worlds.rollout, self.lane_map, lambda values: self.sample(layout.draws(values)),
+            chunk=self.chunk, names=(None if started is None else f"numbers {started}", run), given=given,
+        )  # fmt: skip
+        return found
+
+    def numbers(self, seeds: Sequence[int]) -> NDArray[np.float32]:
+        """The random numbers of seeds, `[B, D]`, as values of `layout`."""
+        layout = self.layout
+
+        def of(seed: jax.Array) -> jax.Array:
+            return layout.values(draw(self._demand, jax.random.split(world_key(seed))[0]))
+
+        return np.asarray(jax.jit(jax.vmap(of))(np.asarray(seeds, np.int32)))
+
     def _measures(self, metrics: tuple[Metric, ...]) -> EvaluateEgo | EvaluateTraffic:
         if not self.egos:
             if metrics:
@@ -258,8 +295,8 @@ class Episodes:
             self._refuse("policy", str(error))
         return policy_code(self._policy, programs)
 
-    def sample(self, key: jax.Array) -> Scenario:
-        """The scenario of a world."""
+    def sample(self, key: Any) -> Scenario:
+        """The scenario of a world, from its key or its random numbers."""
         world = sample_scenario(
             self._demand, self.lane_map, key, self.experiment.slots, self._egos,
             vehicles=self._placed, script=self._script,

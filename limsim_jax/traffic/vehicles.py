@@ -69,7 +69,19 @@ def sample(
       vehicle_type: row of the population; drawn by `share` if not given.
     """
     # One call of the generator: each costs compilation time.
-    draws = jax.random.normal(key, (3 + len(PARAMETERS),))
+    return _vehicle(population, jax.random.normal(key, (3 + len(PARAMETERS),)), vehicle_type)
+
+
+def vehicles_of(
+    population: Population, draws: Float[Array, "N P"], vehicle_type: Int[Array, " N"]
+) -> tuple[Driver, Shape]:
+    """Vehicles of given types from standard normals; every leaf of shape `[N]`."""
+    return jax.vmap(lambda x, y: _vehicle(population, x, y))(draws, vehicle_type)
+
+
+def _vehicle(
+    population: Population, draws: Float[Array, " P"], vehicle_type: Int[Array, ""] | None
+) -> tuple[Driver, Shape]:
     chance, latent, own = draws[0], draws[1:3], draws[3:]
     if vehicle_type is None:
         total = jnp.cumsum(population.share)
@@ -570,4 +582,5 @@ __all__ = [
     "sample",
     "sample_vehicles",
     "uniform_population",
+    "vehicles_of",
 ]

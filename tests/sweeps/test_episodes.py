@@ -17,6 +17,7 @@ from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import encounter, overlaps
 from limsim_jax.sweeps import episode
 from limsim_jax.sweeps.episode import Episodes, succeeds
+from limsim_jax.sweeps.estimate import estimate
 from limsim_jax.sweeps.experiment import Bounds, ExperimentFile
 from limsim_jax.sweeps.moments import key_moments
 
@@ -265,3 +266,30 @@ def test_success_is_what_the_file_says():
     good = succeeds(metrics, {"arrived": True, "completion_time": Bounds(max=30)})
     assert good.tolist() == [1, 0, 0, 1]
     assert succeeds(metrics, {"completion_time": Bounds(min=21)}).tolist() == [0, 1, 0, 1]
+
+
+def test_worlds_from_arrays_run_by_the_same_program():
+    """The numbers of a seed make its world; numbers that differ make another one."""
+    one = episodes("constant_speed")
+    values = one.numbers(SEEDS)
+    changed = np.concatenate([values, values[:1]])
+    changed[3, np.flatnonzero(one.layout.kinds == "normal")] = 0.5
+    given = one.from_numbers(lambda seeds: (changed[seeds], seeds.astype(np.int32)))
+    found, plain = given.run(range(4)), one.run(SEEDS)
+    for name in ("contacts", "duration", "distance", "min_ttc", "min_distance"):
+        np.testing.assert_allclose(found.metrics[name][:3], plain.metrics[name], rtol=1e-3, err_msg=name)
+    assert any(x[3] != x[0] for x in found.metrics.values())
+    assert given.worlds._advance_name == one.worlds._advance_name, "the program of the sweep"
+    replay = given.replay(3, explain=False)
+    assert replay.metrics["distance"] == found.metrics["distance"][3]
+
+
+def test_an_estimate_of_an_event_in_real_worlds():
+    one = episodes("constant_speed")
+    found = estimate(one, "contact", None, method="crude", worlds=200)
+    plain = one.run(range(4)).metrics
+    assert 0 < found.probability.low < found.probability.estimate < 1
+    assert found.km * 1e3 == pytest.approx(plain["distance"].mean(), rel=0.3)
+    assert all(failure.metrics["contacts"] > 0 for failure in found.failures)
+    again = found.episodes.run(range(2)).metrics
+    assert [x.metrics["contact_time"] for x in found.failures[:2]] == again["contact_time"].tolist()

@@ -20,14 +20,15 @@ from limsim_jax.maps.lane_map import (
 )
 from limsim_jax.numerics import safe_sqrt
 from limsim_jax.traffic.car_following import desired_speed, safe_speed
-from limsim_jax.traffic.demand.arrays import FLOW_BITS, NEVER, Demand, EgoStart
+from limsim_jax.traffic.demand.arrays import NEVER, Demand, EgoStart
+from limsim_jax.traffic.demand.draws import Draws, draw, draw_arrivals
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.neighbors import neighbors, sort_vehicles
 from limsim_jax.traffic.script import no_progress
 from limsim_jax.traffic.speeds import BEND_POINTS, bend_squares, lane_speed
 from limsim_jax.traffic.state import start_state
-from limsim_jax.traffic.vehicles import BODY, PARAMETERS, Population, sample_vehicles
+from limsim_jax.traffic.vehicles import BODY, PARAMETERS, Population, vehicles_of
 from limsim_jax.types import Config, Driver, Queues, Scenario, Schedule, Script, Shape, State, Status
 
 _DEAD_END_ROOM = 12.0  # m before the end of a lane that leads nowhere, kept free to change lanes
@@ -36,14 +37,11 @@ _LOOK_CONFIG = Config(dt=0.1)  # how far vehicles at the start look for their le
 _SWEEPS = 8  # times that the speeds at the start are adjusted to those of the leaders
 _FAR = 1e6  # m, where there is none
 
-# Purposes of keys.
-_ARRIVALS, _SEATS, _ROLES, _VEHICLES = range(4)
-
 
 def sample_scenario(
     demand: Demand,
     lane_map: LaneMap,
-    key: Key[Array, ""],
+    key: Key[Array, ""] | Draws,
     slots: int,
     egos: EgoStart | None = None,
     *,
@@ -55,7 +53,7 @@ def sample_scenario(
     Args:
       demand: from `build_demand`.
       lane_map: the one that the demand was built for.
-      key: of the tables.
+      key: of the world, or its random numbers.
       slots: number of vehicle slots `N`.
       egos: the ones that the demand was built with; they are in slots 0 to `E - 1`.
       vehicles: of the script, in the slots behind the egos, with the speeds that they have; NaN: as fast as
@@ -72,15 +70,15 @@ def sample_scenario(
         raise ValueError(f"{egos.count} egos cannot take the places of {initial} vehicles at the start")
     if initial > slots:
         raise ValueError(f"{initial} vehicles at the start do not fit into {slots} slots")
-    time, lane, place, stream = _sample_queues(demand, key)
-    seat, shift = _sample_seats(demand, key)
+    draws = key if isinstance(key, Draws) else draw(demand, key)
+    time, lane, stream = _sample_queues(demand, draws.arrivals)
+    seat, shift = _sample_seats(demand, draws)
     # vehicles of the queues first, then those in the seats
-    number = jnp.concatenate([(lane << FLOW_BITS) + place, -1 - seat])
+    row = jnp.concatenate([jnp.arange(time.shape[0], dtype=jnp.int32), time.shape[0] + seat])
     goals = jnp.concatenate([demand.goals[stream], demand.seat_goals[seat]])
     types = jnp.concatenate([demand.types[stream], demand.seat_types[seat]])
-    goal, vehicle_type = _sample_roles(jax.random.fold_in(key, _ROLES), number, goals, types)
-    key = jax.random.fold_in(key, _VEHICLES)
-    driver, shape = sample_vehicles(demand.population, key, number, vehicle_type)
+    goal, vehicle_type = _roles(draws.roles[row], goals, types)
+    driver, shape = vehicles_of(demand.population, draws.vehicles[row], vehicle_type)
     rows = time.shape[0]
     lane = jnp.concatenate([lane, demand.seat_lane[seat]])
     s = jnp.concatenate(
@@ -154,20 +152,17 @@ def overflow(demand: Demand, key: Key[Array, ""]) -> Bool[Array, ""]:
     The host should raise then. The chance is `RARE` per flow and lane, unless rates were changed after
     `build_demand`.
     """
-    time = _sample_arrivals(demand, key)
+    time = _arrivals(demand, draw_arrivals(demand, key))
     last = jnp.take_along_axis(time, demand.capacity[:, None] - 1, 1)[:, 0]
     return (last < NEVER).any()
 
 
-def _sample_arrivals(demand: Demand, key: Key[Array, ""]) -> Float[Array, "K A"]:
+def _arrivals(demand: Demand, draws: Float[Array, "K A1"]) -> Float[Array, "K A"]:
     """Arrival times (s) of every stream in order, `NEVER` after its end.
 
     The process is stationary from `begin` on: that moment falls into a platoon, or between two, in
     proportion to their durations.
     """
-    key = jax.random.fold_in(key, _ARRIVALS)
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, demand.stream)
-    draws = jax.vmap(lambda k: jax.random.uniform(k, (demand.arrivals + 1,)))(keys)
     headway, size = demand.headway[:, None], demand.size[:, None]
     block = size.astype(headway.dtype) * headway
     # s since the last platoon began (its whole block between platoons), and vehicles of it that passed
@@ -181,32 +176,28 @@ def _sample_arrivals(demand: Demand, key: Key[Array, ""]) -> Float[Array, "K A"]
 
 
 def _sample_queues(
-    demand: Demand, key: Key[Array, ""]
-) -> tuple[Float[Array, " V"], Int[Array, " V"], Int[Array, " V"], Int[Array, " V"]]:
-    """Time (s), lane, place in the queue and stream of every row."""
-    time = _sample_arrivals(demand, key)[demand.row_stream, demand.row_arrival]
+    demand: Demand, draws: Float[Array, "K A1"]
+) -> tuple[Float[Array, " V"], Int[Array, " V"], Int[Array, " V"]]:
+    """Time (s), lane and stream of every row."""
+    time = _arrivals(demand, draws)[demand.row_stream, demand.row_arrival]
     time = jnp.where(demand.row_origin < demand.lane.shape[0], time, NEVER)
     origin, time, stream = lax.sort((demand.row_origin, time, demand.row_stream), num_keys=2)
     lane = demand.lane.at[origin].get(mode="fill", fill_value=NO_LANE)
-    return time, lane, jnp.arange(time.shape[0], dtype=jnp.int32) - demand.start[origin], stream
+    return time, lane, stream
 
 
-def _sample_seats(demand: Demand, key: Key[Array, ""]) -> tuple[Int[Array, " M"], Float[Array, " M"]]:
+def _sample_seats(demand: Demand, draws: Draws) -> tuple[Int[Array, " M"], Float[Array, " M"]]:
     """Seats that are taken, and the place in each (0..1)."""
-    key = jax.random.fold_in(key, _SEATS)
-    seats = demand.seat_weight.shape
     # weighted sampling without replacement: the largest sums of logarithm and Gumbel noise
-    chance = demand.seat_weight + jax.random.gumbel(jax.random.fold_in(key, 0), seats)
+    chance = demand.seat_weight + draws.order
     seat = lax.top_k(chance, demand.initial)[1] if demand.initial else jnp.zeros(0, jnp.int32)
-    return seat, jax.random.uniform(jax.random.fold_in(key, 1), seats)[seat]
+    return seat, draws.place[seat]
 
 
-def _sample_roles(
-    key: Key[Array, ""], number: Int[Array, " V"], goals: Float[Array, "V G"], types: Float[Array, "V Y"]
+def _roles(
+    chance: Float[Array, "V 2"], goals: Float[Array, "V G"], types: Float[Array, "V Y"]
 ) -> tuple[Int[Array, " V"], Int[Array, " V"]]:
     """Goal and type of every vehicle, by cumulative shares."""
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, number)
-    chance = jax.vmap(lambda k: jax.random.uniform(k, (2,)))(keys)
     goal, vehicle_type = (
         jnp.sum(chance[:, k, None] >= shares, -1, dtype=jnp.int32) for k, shares in enumerate((goals, types))
     )

@@ -1,0 +1,165 @@
+"""What `sweep --estimate` does, and the commands about failures: triage and sensitivity."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from limsim_jax.cli.common import JsonOption, table, write_json
+from limsim_jax.cli.results import ExperimentArgument, PolicyOption, ResultsArgument, ScenarioOption
+
+if TYPE_CHECKING:
+    from limsim_jax.sweeps.experiment import ExperimentFile
+
+REPLAYS = 3
+"""Worlds with the event that are written as replays."""
+
+
+def estimate(
+    experiments: Sequence[ExperimentFile],
+    event: str,
+    folder: Path,
+    method: Any,
+    budget: int | None,
+    least: float | None,
+    chunk: int | None,
+    fresh: bool,
+    replays: bool,
+    json_file: Path | None,
+) -> None:
+    """Estimate the probability of an event, print it, and write replays."""
+    from limsim_jax.api.estimate import estimate as run
+    from limsim_jax.api.experiment import Experiment
+    from limsim_jax.files import check_writable
+    from limsim_jax.sweeps.estimate import LEAST
+
+    if len(experiments) != 1:
+        names = ", ".join(one.name for one in experiments)
+        raise typer.BadParameter(f"one experiment at a time, not {names}", param_hint="--estimate")
+    check_writable(json_file)
+    begin = time.perf_counter()
+    found = run(
+        Experiment(experiments[0]), event, method=method or "subset",
+        worlds=5000 if budget is None else budget, least=LEAST if least is None else least,
+        out=folder, chunk=chunk, fresh=fresh,
+    )  # fmt: skip
+    table(found.rows(), f"{found.scenario}, {found.policy}: {found.event.name}")
+    if json_file is not None:
+        write_json(json_file, found.as_json())
+        print(f"wrote {json_file}")
+    if replays:
+        for k in found.telling(REPLAYS):
+            path = found.replay(k).save(folder / "replays" / f"failure-{k}.html")
+            print(f"wrote {path}")
+    print(f"{found.worlds:,} worlds in {time.perf_counter() - begin:.0f} s, kept in {folder}")
+
+
+def triage(
+    results: ResultsArgument,
+    scenario: ScenarioOption = None,
+    policy: PolicyOption = None,
+    most: Annotated[int, typer.Option(min=0, help="Groups whose representative is changed and shown.")] = 8,
+    change: Annotated[
+        bool, typer.Option("--change/--no-change", help="Look for what makes failures go away.")
+    ] = True,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Page to write.  [default: RESULTS/triage.html]")
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Group failures of a sweep by what happened.
+
+    One of each group is changed until it does not happen: what it hangs on."""
+    from limsim_jax.api.results import open_results
+    from limsim_jax.api.triage import triage as run
+    from limsim_jax.files import check_writable
+    from limsim_jax.report.triage import HEAD, rows_of
+
+    opened = open_results(results)
+    for name, known, told in (
+        ("--scenario", opened.scenarios, scenario), ("--policy", opened.policies, policy)
+    ):  # fmt: skip
+        if told is not None and told not in known:
+            message = f"'{told}' is not there; there are {', '.join(known)}"
+            raise typer.BadParameter(message, param_hint=name)
+    page = results / "triage.html" if out is None else out
+    check_writable(json_file, page)
+    found = run(opened, scenario=scenario, policy=policy, most=most, change=change, page=page)
+    if not found:
+        print("no episode failed")
+    else:
+        columns(HEAD, rows_of(found))
+    if json_file is not None:
+        write_json(json_file, [
+            {
+                "scenario": x.cluster.scenario, "policy": x.cluster.policy, "kind": x.cluster.kind,
+                "what": x.cluster.words, "episodes": len(x.cluster.members),
+                "share": x.cluster.share._asdict(), "representative": x.cluster.typical.seed,
+                "seeds": [member.seed for member in x.cluster.members], "change": x.change,
+            }
+            for x in found
+        ])  # fmt: skip
+        print(f"wrote {json_file}")
+    print(f"wrote {page}")
+
+
+def sensitivity(
+    experiment: ExperimentArgument,
+    policy: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Drive the ego by this policy instead.")
+    ] = None,
+    metrics: Annotated[
+        str | None, typer.Option(metavar="A,B", help="Metrics.  [default: contacts, times, speeds]")
+    ] = None,
+    seeds: Annotated[
+        int, typer.Option(help="Seeds of the traffic; each costs a world per parameter, and two.")
+    ] = 40,
+    chunk: Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Page to write.  [default: results/NAME-sensitivity.html]"),
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Say on which assumption about the other drivers a result hangs."""
+    from limsim_jax.api.experiment import Experiment
+    from limsim_jax.api.triage import sensitivity as run
+    from limsim_jax.files import check_writable
+    from limsim_jax.sweeps.experiment import read_experiments
+
+    experiments = read_experiments(experiment, policy=policy)
+    if len(experiments) != 1:
+        names = ", ".join(one.name for one in experiments)
+        raise typer.BadParameter(f"one experiment at a time, not {names}", param_hint="EXPERIMENT")
+    page = Path("results") / f"{experiments[0].name}-sensitivity.html" if out is None else out
+    page.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(json_file, page)
+    wanted = None if metrics is None else [name.strip() for name in metrics.split(",")]
+    found = run(Experiment(experiments[0]), metrics=wanted, seeds=seeds, chunk=chunk, page=page)
+    print(found)
+    if json_file is not None:
+        write_json(json_file, found.as_json())
+        print(f"wrote {json_file}")
+    print(f"wrote {page}")
+
+
+def columns(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    shown = Table(*head, box=None, pad_edge=False)
+    for row in rows:
+        shown.add_row(*(Text(cell) for cell in row))
+    Console().print(shown)
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    for command in (triage, sensitivity):
+        app.command()(command)

@@ -1,0 +1,453 @@
+"""The probability of a rare event in the worlds of an experiment.
+
+The random numbers of a world are one array of standard normals (`traffic.demand.draws.Layout`). Samplers of
+`rare_events` move through it, and every array they ask for is a world that the program of a sweep runs. What
+a policy draws hangs on the array, too, so an array is a world that can be run again.
+
+    DIR/estimate.json            how it is made, and what was found
+    DIR/worlds/000012.npz        metrics of a batch of worlds: an interrupted estimate goes on from these
+    DIR/failures.npz             worlds with the event: random numbers, weights, metrics
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import shutil
+import time
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limsim_jax.files import write_whole
+from limsim_jax.rare_events.estimate import RUNS, RareEvent, check_settings, rare_event
+from limsim_jax.rare_events.samplers import LEVEL
+from limsim_jax.statistics import Interval
+from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.events import Event, event_of
+from limsim_jax.sweeps.store import NOT_COMPARED, ResultsError
+
+Method = Literal["subset", "crude", "cross-entropy"]
+
+LEAST = 1e-4
+"""Probability per episode below which an event is not followed, unless told."""
+
+LEAST_SAMPLES = 20
+"""Worlds per level and run, at least."""
+
+Tell = Callable[[int, int], None]
+"""Is told how many worlds have run, and how many will at most."""
+
+
+def worlds_per_level(worlds: int, method: Method, least: float, runs: int = RUNS) -> int:
+    """Worlds per level and run; at most `worlds` run in all.
+
+    Raises:
+      ValueError: too few.
+    """
+    if not 0 < least < 1:
+        raise ValueError(f"least: {least:g}; a probability between 0 and 1, such as {LEAST:g}")
+    levels = max(round(np.log(least) / np.log(LEVEL)), 1)
+    if method == "crude":
+        share = float(runs)
+    elif method == "subset":
+        share = runs * (1 + (1 - LEVEL) * (levels + 1))  # one more: points of a chain that are equal
+    else:
+        share = runs * (2 * levels + 1)
+    samples = int(worlds / share)
+    if samples < LEAST_SAMPLES:
+        needed = int(np.ceil(LEAST_SAMPLES * share))
+        raise ValueError(
+            f"worlds: {worlds} are too few for {method} down to {least:g}; at least {needed}, "
+            "or a larger least probability"
+        )
+    return samples
+
+
+class Failure(NamedTuple):
+    """A world with the event."""
+
+    number: int  # among the failures
+    weight: float  # share among all worlds with the event
+    metrics: dict[str, float]  # of its ego that is nearest to the event, or beyond it farthest
+
+
+class Shift(NamedTuple):
+    """How a random number differs in worlds with the event."""
+
+    what: str
+    mean: Interval  # standard deviations; 0 in all worlds together
+    p: float  # two-sided, adjusted for all numbers that were looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """How probable an event is under a policy.
+
+    Attributes:
+      scenario, policy: names.
+      event: what is looked for.
+      found: the probability per episode, and how it came about.
+      hours, km: of an episode, on average; of all egos of a world together.
+      failures: worlds with the event, the most telling first.
+      shifts: what sets them apart.
+      worlds: that ran, or were on disk.
+    """
+
+    scenario: str
+    policy: str
+    event: Event
+    found: RareEvent
+    hours: float
+    km: float
+    failures: tuple[Failure, ...]
+    shifts: tuple[Shift, ...]
+    worlds: int
+    values: NDArray[np.float32] = field(repr=False)  # [M, D] random numbers of the failures
+    episodes: Episodes = field(repr=False)  # of the failures: seed k is failure k
+
+    @property
+    def probability(self) -> Interval:
+        """Per episode."""
+        return self.found.probability
+
+    @property
+    def per_hour(self) -> Interval:
+        """Events per hour of driving."""
+        return _over(self.probability, self.hours)
+
+    @property
+    def per_million_km(self) -> Interval:
+        """Events per million km."""
+        return _over(self.probability, self.km / 1e6)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """The table in two columns."""
+        level = f"{self.found.level * 100:g} %"
+        found = self.found
+        cost = f"{found.method}, {len(found.runs)} runs, {self.worlds:,} worlds"
+        rows = [
+            ("event", self.event.meaning),
+            ("per episode", f"{_said(self.probability)}  ({level})"),
+            ("per hour", _said(self.per_hour)),
+            ("per million km", _said(self.per_million_km)),
+            ("exposure", f"{self.hours * 3600:.1f} s and {self.km:.3f} km per episode"),
+            ("method", cost),
+        ]
+        rows += [("note", note) for note in found.notes]
+        if self.failures:
+            rows.append(("worlds with the event", f"{len(self.failures)} different ones"))
+            for shift in self.shifts:
+                rows.append(("what sets them apart", _shift_said(shift)))
+            if not self.shifts:
+                rows.append(("what sets them apart", "no single random number"))
+        return rows
+
+    def __str__(self) -> str:
+        rows = [(f"{self.scenario}, {self.policy}", ""), *self.rows()]
+        width = max(len(name) for name, _ in rows[1:])
+        return "\n".join([rows[0][0], *(f"  {name:<{width}}  {text}" for name, text in rows[1:])])
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "scenario": self.scenario,
+            "policy": self.policy,
+            "event": self.event.name,
+            "meaning": self.event.meaning,
+            "level": self.found.level,
+            "per_episode": self.probability._asdict(),
+            "per_hour": self.per_hour._asdict(),
+            "per_million_km": self.per_million_km._asdict(),
+            "hours_per_episode": self.hours,
+            "km_per_episode": self.km,
+            "method": self.found.method,
+            "runs": self.found.runs.tolist(),
+            "worlds": self.worlds,
+            "notes": list(self.found.notes),
+            "shifts": [{"what": x.what, **x.mean._asdict(), "p": x.p} for x in self.shifts],
+            "failures": len(self.failures),
+        }
+
+    def telling(self, count: int = 3) -> list[int]:
+        """Failures to look at: of each kind of contact the most probable, then by weight."""
+        order = sorted(range(len(self.failures)), key=lambda k: -self.failures[k].weight)
+        kinds: dict[Any, int] = {}
+        for k in order:
+            metrics = self.failures[k].metrics
+            kinds.setdefault(str((metrics.get("contact_type"), metrics.get("contact_other"))), k)
+        first = list(kinds.values())
+        return [*first, *(k for k in order if k not in first)][:count]
+
+
+def _over(p: Interval, exposure: float) -> Interval:
+    return Interval(*(x / exposure if exposure > 0 else np.nan for x in p))
+
+
+def _said(x: Interval) -> str:
+    if x.estimate == 0:
+        return f"below {x.high:.3g}"
+    return f"{x.estimate:.3g} [{x.low:.3g}, {x.high:.3g}]"
+
+
+def _shift_said(shift: Shift) -> str:
+    word = "higher" if shift.mean.estimate > 0 else "lower"
+    low, high = sorted((abs(shift.mean.low), abs(shift.mean.high)))
+    return f"{shift.what}: {abs(shift.mean.estimate):.1f} [{low:.1f}, {high:.1f}] standard deviations {word}"
+
+
+class _Log:
+    """Metrics of batches on disk, in the order of their calls."""
+
+    def __init__(self, folder: Path | None, about: Mapping[str, Any], fresh: bool) -> None:
+        self.folder, self._next = folder, 0
+        if folder is None:
+            return
+        index = folder / "estimate.json"
+        if fresh and index.exists():
+            shutil.rmtree(folder / "worlds", ignore_errors=True)
+            index.unlink()
+        if (folder / "results.json").exists():
+            raise ResultsError(f"{folder}: holds the results of a sweep; name another folder with --out")
+        (folder / "worlds").mkdir(parents=True, exist_ok=True)
+        self._about = json.loads(json.dumps(about))
+        if index.exists():
+            try:
+                there = json.loads(index.read_text(encoding="utf-8"))["made_by"]
+            except (ValueError, KeyError, TypeError):
+                raise ResultsError(
+                    f"{index}: damaged; remove the folder, or start anew with --fresh"
+                ) from None
+            if (differs := _difference(there, self._about)) is not None:
+                raise ResultsError(f"{folder}: made with {differs}; use another folder, or --fresh")
+        self.write({})
+
+    def write(self, found: Mapping[str, Any]) -> None:
+        """Put down how it is made, and what was found."""
+        if self.folder is not None:
+            text = json.dumps({"made_by": self._about, **found}, indent=1)
+            write_whole(self.folder / "estimate.json", (text + "\n").encode())
+
+    def batch(
+        self, values: NDArray[np.float32], run: Callable[[], tuple[list[str], NDArray[np.float64]]]
+    ) -> tuple[list[str], NDArray[np.float64]]:
+        """Metrics of worlds: those on disk, or those of a run."""
+        number, self._next = self._next, self._next + 1
+        if self.folder is None:
+            return run()
+        path = self.folder / "worlds" / f"{number:06d}.npz"
+        mark = hashlib.blake2b(values.tobytes(), digest_size=16).hexdigest()
+        try:
+            with np.load(path) as kept:
+                if str(kept["mark"]) == mark:
+                    return kept["names"].tolist(), kept["metrics"]
+        except FileNotFoundError:
+            pass
+        except Exception:  # a damaged file is run again
+            path.unlink(missing_ok=True)
+        names, metrics = run()
+        data = io.BytesIO()
+        np.savez_compressed(data, mark=mark, names=names, metrics=metrics)
+        write_whole(path, data.getvalue())
+        return names, metrics
+
+
+def _difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str | None:
+    for name in sorted({*there, *here} - NOT_COMPARED):
+        if there.get(name) != here.get(name):
+            if isinstance(there.get(name), dict) and isinstance(here.get(name), dict):
+                return _difference(there[name], here[name]) or name
+            if name == "source":
+                return "another version of limsim_jax"
+            return f"{name} = {str(there.get(name))[:60]}, now {str(here.get(name))[:60]}"
+    return None
+
+
+class _Worlds:
+    """The limit state of worlds, from their random numbers."""
+
+    def __init__(self, episodes: Episodes, event: Event, log: _Log, tell: Tell | None, most: int) -> None:
+        self.layout = episodes.layout
+        self.event, self._log, self._tell, self._most = event, log, tell, most
+        self._values = np.zeros((1, self.layout.size), np.float32)
+        self.episodes = episodes.from_numbers(self.given)
+        self.each = max(episodes.egos, 1)
+        self.count, self.ran = 0, 0
+        self.exposure: tuple[float, float] | None = None  # hours and km per episode
+        self.found: dict[bytes, dict[str, float]] = {}  # metrics of worlds with the event
+
+    def given(self, seeds: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Random numbers of a batch, and the seeds of its policies."""
+        values = self._values[seeds]
+        return values, np.array([zlib.crc32(row.tobytes()) & 0x7FFFFFFF for row in values], np.int32)
+
+    def show(self, values: NDArray[np.float32]) -> Episodes:
+        """Episodes whose seed k is row k of these random numbers."""
+        self._values = values
+        return self.episodes
+
+    def __call__(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        values = self.layout.from_normals(z)
+        names, metrics = self._log.batch(values, lambda: self._run(values))
+        columns = dict(zip(names, metrics, strict=True))
+        g = self.event.limit(columns).reshape(len(z), self.each)
+        if self.exposure is None:  # the first batch of every method is of plain worlds
+            hours, km = (np.nansum(columns[x]) / len(z) for x in ("duration", "distance"))
+            self.exposure = float(hours) / 3600, float(km) / 1e3
+        worst = g.argmin(1)
+        for k in np.flatnonzero(g.min(1) <= 0):
+            row = int(k) * self.each + int(worst[k])
+            self.found[values[k].tobytes()] = {name: float(x[row]) for name, x in columns.items()}
+        self.count += len(z)
+        if self._tell is not None:
+            self._tell(self.count, self._most)
+        return g.min(1)
+
+    def _run(self, values: NDArray[np.float32]) -> tuple[list[str], NDArray[np.float64]]:
+        self._values, size, parts = values, self.episodes.chunk, []
+        for first in range(0, len(values), size):
+            outcome = self.episodes.run(range(first, min(first + size, len(values))))
+            parts.append(np.stack(list(outcome.metrics.values())))
+            self.ran += len(outcome.seeds) // self.each
+            if self._tell is not None:
+                self._tell(self.count + min(first + size, len(values)), self._most)
+        return list(self.episodes.units), np.concatenate(parts, 1)
+
+
+def estimate(
+    episodes: Episodes,
+    event: str,
+    out: Path | None,
+    *,
+    method: Method = "subset",
+    worlds: int = 5000,
+    runs: int = RUNS,
+    least: float = LEAST,
+    level: float = 0.95,
+    seed: int = 0,
+    fresh: bool = False,
+    tell: Tell | None = None,
+) -> Estimate:
+    """Estimate the probability of an event; see `api.estimate.estimate`."""
+    if not episodes.egos:
+        raise ValueError(f"{episodes.scenario}: ego: there is none, so no event of one; add an [ego]")
+    wanted = event_of(event, episodes.units)
+    samples = worlds_per_level(worlds, method, least, runs)
+    layout = episodes.layout
+    if not layout.size:
+        raise ValueError(f"{episodes.scenario}: nothing is random in its worlds; one run says it all")
+    check_settings(layout.size, method, samples, runs, least, None, level)
+    settings = {
+        "event": wanted.name, "method": method, "samples": samples, "runs": runs, "least": least,
+        "seed": seed, "level": level,
+    }  # fmt: skip
+    log = _Log(out, {**episodes.provenance(), "estimate": settings}, fresh)
+    ask = _Worlds(episodes, wanted, log, tell, worlds)
+    begin = time.perf_counter()
+    found = rare_event(
+        ask, layout.size, method=method, samples=samples, runs=runs, least=least, level=level, seed=seed
+    )
+    seconds = time.perf_counter() - begin
+    values, weights, metrics = _distinct(ask, found)
+    hours, km = ask.exposure or (np.nan, np.nan)
+    done = Estimate(
+        scenario=episodes.scenario,
+        policy=episodes.policy,
+        event=wanted,
+        found=found,
+        hours=hours,
+        km=km,
+        failures=tuple(Failure(k, float(weights[k]), metrics[k]) for k in range(len(weights))),
+        shifts=shifts_of(episodes, found),
+        worlds=found.calls,
+        values=values,
+        episodes=ask.show(values) if len(values) else ask.episodes,
+    )
+    log.write({**done.as_json(), "ran_now": ask.ran, "seconds": round(seconds, 1)})
+    if out is not None and len(values):
+        names = list(episodes.units)
+        table = np.array([[row[name] for name in names] for row in metrics])
+        data = io.BytesIO()
+        np.savez_compressed(data, values=values, weights=weights, names=names, metrics=table)
+        write_whole(out / "failures.npz", data.getvalue())
+    return done
+
+
+def _distinct(
+    ask: _Worlds, found: RareEvent
+) -> tuple[NDArray[np.float32], NDArray[np.float64], list[dict[str, float]]]:
+    """Different worlds with the event by falling weight: chains stay at places."""
+    values = ask.layout.from_normals(found.points)
+    if not len(values):
+        return values, np.zeros(0), []
+    kept, which = np.unique(values, axis=0, return_inverse=True)
+    weights = np.bincount(which.ravel(), found.weights, len(kept)).astype(np.float64)
+    order = np.argsort(-weights, kind="stable")
+    return kept[order], weights[order], [ask.found[kept[k].tobytes()] for k in order]
+
+
+def shifts_of(episodes: Episodes, found: RareEvent, most: int = 5) -> tuple[Shift, ...]:
+    """What sets worlds with the event apart: means of random numbers, from run to run.
+
+    In all worlds together each number has mean 0 and standard deviation 1. The means of a kind over all
+    vehicles count as numbers, too. Tests are Student's over the runs, adjusted for their number (Holm).
+    """
+    from scipy.stats import t
+
+    from limsim_jax.statistics import holm
+
+    runs = [found.run == k for k in range(len(found.runs))]
+    runs = [there for there in runs if there.any()]
+    if len(runs) < 3:
+        return ()
+    numbers = episodes.layout.numbers
+    kinds = sorted({number.what for number in numbers})
+    member = np.array([[number.what == kind for number in numbers] for kind in kinds], float)
+    member /= np.sqrt(member.sum(1, keepdims=True))
+    means = []
+    for there in runs:
+        w = found.weights[there]
+        w = w / w.sum() if w.sum() > 0 else np.full(len(w), 1 / len(w))
+        mean = w @ found.points[there]
+        means.append(np.concatenate([member @ mean, mean]))
+    x, n = np.array(means), len(means)
+    middle, error = x.mean(0), x.std(0, ddof=1) / np.sqrt(n)
+    p = 2 * t.sf(np.abs(middle) / np.maximum(error, 1e-12), n - 1)
+    adjusted, half = holm(p.tolist()), t.ppf(0.975, n - 1) * error
+    names = [f"{kind} of all vehicles" for kind in kinds] + _names(episodes)
+    order = [k for k in np.argsort(-np.abs(middle)) if adjusted[k] < 0.05][:most]
+    return tuple(
+        Shift(
+            names[k],
+            Interval(*map(float, (middle[k], middle[k] - half[k], middle[k] + half[k]))),
+            adjusted[k],
+        )
+        for k in order
+    )
+
+
+def _names(episodes: Episodes) -> list[str]:
+    """Every random number in words."""
+    ids = episodes.town.lane_ids
+    found = []
+    for number in episodes.layout.numbers:
+        lane = ids[number.lane] if 0 <= number.lane < len(ids) else "?"
+        if number.what == "gap":
+            found.append(f"gap before arrival {number.place + 1} on lane {lane}")
+        elif number.vehicle < episodes.layout.rows:
+            found.append(f"{number.what} of vehicle {number.place + 1} that enters on lane {lane}")
+        else:
+            found.append(f"{number.what} of a vehicle that starts on lane {lane}")
+    return found
+
+
+def failures_of(folder: Path) -> tuple[NDArray[np.float32], Sequence[float]]:
+    """Random numbers `[M, D]` and weights of the failures in a folder."""
+    with np.load(folder / "failures.npz") as kept:
+        return kept["values"], kept["weights"].tolist()

@@ -1,0 +1,53 @@
+"""Commands about rare events: what they refuse, and what triage prints."""
+
+import json
+
+import pytest
+
+from limsim_jax import cli
+
+FAULTS = [
+    (("--method", "crude"), "--method: only with --estimate"),
+    (("--budget", "3000"), "--budget: only with --estimate"),
+    (("--estimate", "contact", "--shard", "0/2"), "an estimate is one run of its own, without --shard"),
+    (("--estimate", "contact", "--until-ci", "0.1"), "without --until-ci"),
+    (("--estimate", "contact", "--workers", "2"), "without --workers"),
+]
+
+
+@pytest.mark.parametrize(("options", "said"), FAULTS, ids=[said for _, said in FAULTS])
+def test_options_that_do_not_go_together_are_one_line(options, said, capsys, tmp_path):
+    assert cli.main(["sweep", "roundabout", *options, "--out", str(tmp_path / "out")]) == 2
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", [["sweep", "paper", "--estimate", "contact"], ["sensitivity", "paper"]])
+def test_one_experiment_at_a_time(command, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(command) == 2
+    err = capsys.readouterr().err
+    assert "one experiment at a time, not highway, ramp" in err and err.count("\n") == 1
+
+
+def test_triage_of_no_results_is_one_line(capsys, tmp_path):
+    assert cli.main(["triage", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_triage_of_a_sweep(capsys, tmp_path):
+    from fake_episodes import FakeEpisodes
+
+    from limsim_jax.sweeps.runner import sweep
+
+    sweep([FakeEpisodes(failures=0.3)], range(40), tmp_path)
+    report = tmp_path / "found.json"
+    assert cli.main(["triage", str(tmp_path), "--no-change", "--json", str(report)]) == 0
+    out = capsys.readouterr().out
+    found = json.loads(report.read_text())
+    assert sum(x["episodes"] for x in found) == len({seed for x in found for seed in x["seeds"]}) > 3
+    assert "what happened" in out and "triage.html" in out
+    assert (tmp_path / "triage.html").read_text().count("<tr>") == len(found) + 1
+    assert cli.main(["triage", str(tmp_path), "--policy", "mine"]) == 2
+    assert "'mine' is not there; there are still" in capsys.readouterr().err
