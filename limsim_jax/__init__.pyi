@@ -22,6 +22,7 @@ from .api.triage import sensitivity as sensitivity
 from .api.triage import triage as triage
 from .api.world import World as World
 from .bridges import carla as carla
+from .bridges.chat.server import ChatServer as ChatServer
 from .bridges.formats.export import export as export
 from .bridges.sumo.messages import SumoError as SumoError
 from .bridges.sumo.referee import referee as referee
@@ -48,6 +49,8 @@ from .policies.end_to_end import EndToEnd as EndToEnd
 from .policies.end_to_end import ObserveSensors as ObserveSensors
 from .policies.host import HostPolicy as HostPolicy
 from .policies.host import Observation as Observation
+from .policies.language.driver import language as language
+from .policies.language.rules import RuleTable as RuleTable
 from .policies.limsim_tm import LimSimTM as LimSimTM
 from .policies.pdm import PDMClosed as PDMClosed
 from .policies.pdm import PDMHybrid as PDMHybrid

@@ -29,7 +29,7 @@ NAMES = {
     "Rare events": ["estimate", "Estimate", "triage", "sensitivity", "rare_event", "RareEvent"],
     "Policies": [
         *("LikeTraffic", "ConstantSpeed", "FollowLane", "PDMClosed", "PDMHybrid", "LimSimTM"),
-        *("EndToEnd", "AreaOfInterest", "named"),
+        *("EndToEnd", "AreaOfInterest", "named", "language", "RuleTable"),
     ],
     "Policies of one's own": [
         *("Policy", "HostPolicy", "Observation", "ObserveSensors", "Command", "Control", "Trajectory"),
@@ -56,6 +56,7 @@ NAMES = {
         "TrafficClient",
         "DriverServer",
         "remote_driver",
+        "ChatServer",
     ],
     "Beside SUMO": ["SumoWorld", "referee", "SumoError"],
 }

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from limsim_jax.policies.language.driver import offline
+from limsim_jax.sweeps.answers import recall, stored_answers
 from limsim_jax.sweeps.store import Results as Stored
 from limsim_jax.sweeps.store import ResultsError
 from limsim_jax.sweeps.store import open_results as open_stored
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from limsim_jax.api.world import World
+    from limsim_jax.policies.language.store import Answer
     from limsim_jax.report.compare import Comparison
     from limsim_jax.report.tables import TextTable
     from limsim_jax.sweeps.episode import Episodes
@@ -166,7 +169,18 @@ class Results:
             group, seed, ego = self._group(scenario, policy), row, 0
         else:
             group, seed, ego = (row["scenario"], row["policy"]), row["seed"], row.get("ego", 0)
-        return World.run(self.worlds_of(*group), seed, ego)
+        worlds = self.worlds_of(*group)
+        recall(worlds, self.path, [seed])
+        return World.run(worlds, seed, ego)
+
+    def answers(self, seed: int, *, scenario: str | None = None, policy: str | None = None) -> list[Answer]:
+        """What a language model answered in a world; empty where none drove.
+
+        Args:
+          seed: of the world.
+          scenario, policy: names, where the results hold several.
+        """
+        return stored_answers(self.path, *self._group(scenario, policy), seed)
 
     def trajectories(
         self, seeds: Sequence[int], *, scenario: str | None = None, policy: str | None = None
@@ -187,6 +201,7 @@ class Results:
             raise ValueError(f"no scenario '{scenario}' with policy '{policy}'; there are {self._groups()}")
         parts = []
         for group in groups:
+            recall(self.worlds_of(*group), self.path, seeds)
             for seed in seeds:
                 part = World.run(self.worlds_of(*group), seed, explain=False).trajectories()
                 for place, (name, value) in enumerate(zip(("scenario", "policy"), group, strict=True)):
@@ -213,7 +228,9 @@ class Results:
         from limsim_jax.report.page import write_report
 
         def again(scenario: str, policy: str, seeds: Sequence[int]) -> Sequence[tuple[Any, ...]]:
-            return self.worlds_of(scenario, policy).replays([(seed, 0) for seed in seeds], brief=True)
+            worlds = self.worlds_of(scenario, policy)
+            recall(worlds, self.path, seeds)
+            return worlds.replays([(seed, 0) for seed in seeds], brief=True)
 
         target = self.path / "report.html" if path is None else Path(path)
         return write_report(self.stored, target, replayer=again, worst=worst, table=self._summary)
@@ -288,4 +305,5 @@ def rebuild(stored: Stored, scenario: str, policy: str, *, cores: int | None = N
     if "engine" in about:  # a bridge ran them; it lies above this room
         return importlib.import_module("limsim_jax.bridges.sumo.world").rebuild(about)
     experiment = ExperimentFile.model_validate(about["experiment"] | {"map": about["map_file"]})
-    return Episodes(experiment, chunk=about["chunk"])
+    with offline():
+        return Episodes(experiment, chunk=about["chunk"])

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from limsim_jax.api.perception import Perception
     from limsim_jax.api.sensed import Film, Sensed
     from limsim_jax.policies.base import PolicyLike
+    from limsim_jax.policies.language.store import Answer
     from limsim_jax.sensors.rig import Rig
     from limsim_jax.sweeps.episode import Episodes
     from limsim_jax.types import State
@@ -59,6 +60,8 @@ class World:
       trace: every step, NumPy, `[T, ...]`; lengths in m, times in s, positions from the map's origin.
       metrics: columns of the row of this world; NaN: not measured.
       moments: key moments, the worst first.
+      episodes: that it is a world of; None: it cannot be forked.
+      answers: of a language model that drives the ego.
     """
 
     scenario: str
@@ -70,6 +73,7 @@ class World:
     metrics: dict[str, float]
     moments: list[dict[str, Any]]
     episodes: Episodes | None = None
+    answers: Sequence[Answer] = ()
 
     @classmethod
     def run(cls, episodes: Episodes, seed: int, ego: int = 0, *, explain: bool = True) -> World:
@@ -79,7 +83,7 @@ class World:
         found = episodes.replay(seed, ego, explain=explain)
         return cls(
             episodes.scenario, episodes.policy, seed, found.ego, episodes.town, found.trace, found.metrics,
-            found.moments, episodes,
+            found.moments, episodes, found.answers,
         )  # fmt: skip
 
     @property
@@ -123,7 +127,7 @@ class World:
         if suffix == ".html":
             from limsim_jax.report.viewer import write_viewer
 
-            options = {"title": self.title, "moments": self.moments} | options
+            options = {"title": self.title, "moments": self.moments, "answers": self.answers} | options
             write_viewer(*place, ego=self.ego if egos else None, **options)
         elif suffix in (".gif", ".mp4"):
             from limsim_jax.report.video import write_video

@@ -50,7 +50,7 @@ SECONDS = 60.0
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    for command in (sweep, warm, report, compare, verify, replay, export):
+    for command in (sweep, warm, report, compare, verify, replay, export, reflect):
         app.command()(command)
 
 
@@ -61,6 +61,13 @@ def sweep(
         typer.Option(
             help="How many worlds of each scenario: seeds 0, 1, 2, ...; of a .xosc so many of its variants."
             "  [default: 100; of a .xosc all]"
+        ),
+    ] = None,
+    odd: Annotated[
+        bool | None,
+        typer.Option(
+            "--odd-seeds/--even-seeds",
+            help="Seeds 1, 3, 5, ... or 0, 2, 4, ...: even ones teach language models, odd ones test them.",
         ),
     ] = None,
     out: Annotated[
@@ -163,6 +170,8 @@ def sweep(
     if is_scenario(experiment):
         if engine != "limsim" or workers is not None or stop is not None:
             raise typer.BadParameter("not with --engine, --workers or --until-ci", param_hint="EXPERIMENT")
+        if odd is not None:
+            raise typer.BadParameter("a .xosc has variants, no seeds", param_hint="--odd-seeds")
         sweep_scenarios(
             Path(experiment), policy, out=out, variants=seeds, override=map_file, chunk=chunk, shard=part,
             on_error=on_error, fresh=fresh, horizon=horizon, root=root, lenient=lenient, controlled=at_once,
@@ -174,6 +183,9 @@ def sweep(
     seeds = 100 if seeds is None else seeds
     if not 1 <= seeds <= 2**31:
         raise typer.BadParameter(f"{seeds}; between 1 and 2^31", param_hint="--seeds")
+    worlds = range(seeds) if odd is None else range(int(odd), 2 * seeds, 2)
+    if worlds[-1] >= 2**31:
+        raise typer.BadParameter(f"{seeds}; the last seed would be {worlds[-1]}", param_hint="--seeds")
     if chunk is not None and chunk < 1:
         raise typer.BadParameter(f"{chunk}; at least 1", param_hint="--chunk")
     if workers is not None and workers < 1:
@@ -232,12 +244,12 @@ def sweep(
 
                 factory = functools.partial(build, experiments, chunk, cores=1)
                 summary = sweep_on_ray(
-                    factory, range(seeds), folder, workers=workers, address=address, shard=part,
+                    factory, worlds, folder, workers=workers, address=address, shard=part,
                     until_ci=stop, progress=tell, on_error=on_error, fresh=fresh,
                 )  # fmt: skip
             else:
                 summary = runner.sweep(
-                    made, range(seeds), folder, shard=part, until_ci=stop, progress=tell,
+                    made, worlds, folder, shard=part, until_ci=stop, progress=tell,
                     on_error=on_error, fresh=fresh,
                 )  # fmt: skip
     except KeyboardInterrupt:
@@ -411,6 +423,7 @@ def replay(
     from limsim_jax.api.results import rebuild
     from limsim_jax.api.sensed import check_sensors, watch
     from limsim_jax.api.world import World
+    from limsim_jax.sweeps.answers import recall
     from limsim_jax.sweeps.store import open_results
 
     opened = open_results(results)
@@ -442,6 +455,7 @@ def replay(
         if not episodes.egos:
             raise typer.BadParameter(f"'{group[0]}' has no ego", param_hint="--sensors")
         check_sensors(episodes, sensors)
+    recall(episodes, results, [seed])
     world = World.run(episodes, seed)
     for row in world.moments:
         value = "" if math.isnan(row["value"]) else f", {row['value']:.2f}"
@@ -488,6 +502,7 @@ def export(
     from limsim_jax.bridges.formats.export import FORMATS, format_of
     from limsim_jax.bridges.formats.export import export as write
     from limsim_jax.files import check_writable
+    from limsim_jax.sweeps.answers import recall
     from limsim_jax.sweeps.store import open_results
 
     if to is None and out is None:
@@ -502,9 +517,35 @@ def export(
     path.parent.mkdir(parents=True, exist_ok=True)
     check_writable(path)
     stored = _known(opened, group, seed)
-    world = World.run(rebuild(opened, *group), seed, explain=False)
+    worlds = rebuild(opened, *group)
+    recall(worlds, results, [seed])
+    world = World.run(worlds, seed, explain=False)
     _tell_differences(world.metrics, stored)
     print(f"wrote {write(world, path, name, every=every)}")
+
+
+def reflect(
+    results: ResultsArgument,
+    memory: Annotated[Path, typer.Option(metavar="FILE", help="Memories, made or added to (JSON Lines).")],
+    last: Annotated[int, typer.Option(min=1, help="Decisions before a failure to look at.")] = 3,
+    scenario: ScenarioOption = None,
+    policy: PolicyOption = None,
+) -> None:
+    """Let a language model look back at its failures on even seeds.
+
+    What it learns goes into a file for the option memory of its next sweep (--odd-seeds)."""
+    from limsim_jax.api.results import rebuild
+    from limsim_jax.sweeps.reflect import reflect as look_back
+    from limsim_jax.sweeps.store import open_results
+
+    opened = open_results(results)
+    group = _group(opened, scenario, policy)
+    drivers = rebuild(opened, *group).notes.drivers
+    if not drivers:
+        raise typer.BadParameter(f"{group[0]} ({group[1]}) has no language model", param_hint="--policy")
+    drivers[0].chat.check()
+    learnt = look_back(opened, drivers[0], memory, scenario=group[0], policy=group[1], last=last, say=print)
+    print(f"wrote {memory}: {len(learnt)} memories")
 
 
 # --- helpers -----------------------------------------------------------------------------------------
@@ -588,7 +629,10 @@ def _check_seed(seed: int) -> None:
 
 def _tell_differences(metrics: Mapping[str, float], stored: Mapping[str, Any] | None) -> None:
     """A note if a world is not the one that is stored."""
-    differs = [] if stored is None else [x for x, value in metrics.items() if not _alike(value, stored[x])]
+    from limsim_jax.metrics.answers import METERED
+
+    compared = [] if stored is None else [name for name in metrics if name not in METERED]
+    differs = [name for name in compared if stored and not _alike(metrics[name], stored[name])]
     if differs:
         print(f"note: not the episode that is stored: {', '.join(differs[:3])} differ; 'verify' may tell why")
 
@@ -666,12 +710,14 @@ def _write_report(
     """`made`: worlds that are compiled already."""
     from limsim_jax.api.results import rebuild
     from limsim_jax.report.page import write_report
+    from limsim_jax.sweeps.answers import recall
 
     known = {(one.scenario, one.policy): one for one in made}
 
     def again(scenario: str, policy: str, seeds: Sequence[int]) -> Sequence[tuple[Any, ...]]:
         group = scenario, policy
         episodes = known[group] if group in known else rebuild(results, *group)
+        recall(episodes, results.path, seeds)
         return episodes.replays([(seed, 0) for seed in seeds], brief=True)
 
     write_report(results, path, replayer=again, worst=worst, seconds=seconds, say=print, table=table)

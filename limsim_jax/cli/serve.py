@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -40,3 +41,40 @@ def traffic(
             flush=True,
         )
         server.wait()
+
+
+@serve_app.command()
+def chat(
+    model: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="rules: reads the description and answers by a table of rules; faults: every fault of real "
+            "servers in turn; may be repeated.  [default: both]",
+        ),
+    ] = None,
+    host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="0: any free one.")] = 8080,
+    key_variable: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Environment variable with the key that requests need.")
+    ] = None,
+) -> None:
+    """Serve models of our own as an OpenAI-compatible chat server.
+
+    Language drivers can be tried on it."""
+    from limsim_jax.bridges.chat.faults import Faults
+    from limsim_jax.bridges.chat.rules import rules
+    from limsim_jax.bridges.chat.server import ChatServer
+
+    key = ""
+    if key_variable is not None:
+        key = os.environ.get(key_variable, "")
+        if not key:
+            raise typer.BadParameter(f"${key_variable} is empty", param_hint="--key-variable")
+    known = {"rules": rules, "faults": Faults()}
+    for name in model or ():
+        if name not in known:
+            raise typer.BadParameter(f"'{name}'; known are {', '.join(known)}", param_hint="--model")
+    server = ChatServer({name: known[name] for name in model or known}, host=host, port=port, key=key)
+    print(f"listening on {server.url}, models: {', '.join(server.models)}", flush=True)
+    server.wait()

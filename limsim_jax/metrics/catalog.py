@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from limsim_jax.metrics import ego, traffic
+from limsim_jax.metrics.answers import LANGUAGE
 from limsim_jax.metrics.description import Better, Description, Headline, Kind
 from limsim_jax.metrics.measure import Metric
 
@@ -44,8 +45,10 @@ TRAFFIC = traffic.DESCRIPTIONS
 
 
 def catalog(own: Sequence[Metric] = ()) -> tuple[Description, ...]:
-    """Every column of an episode, in order: of the ego, of the traffic, then metrics of one's own."""
-    return (*EGO, *TRAFFIC, *TOTALS, *(metric.description for metric in own))
+    """Every column of an episode, in order.
+
+    Of the ego, the traffic, a language model that drives, then metrics of one's own."""
+    return (*EGO, *TRAFFIC, *TOTALS, *LANGUAGE, *(metric.description for metric in own))
 
 
 _PERCENT = {"unit": "%", "scale": 100.0}

@@ -11,7 +11,9 @@ Better = Literal["higher", "lower", "neither"]
 Kind = Literal["mean", "proportion", "label", "rate"]
 """How seeds are summed up: a mean, a share of 0 and 1, not at all (a slot, a type), events per distance."""
 
-Section = Literal["Drive and rules", "Safety", "Comfort", "Scores", "Traffic", "Own metrics"]
+Section = Literal[
+    "Drive and rules", "Safety", "Comfort", "Scores", "Language model", "Traffic", "Own metrics"
+]
 """Part of the report."""
 
 SECTIONS: tuple[Section, ...] = (
@@ -19,6 +21,7 @@ SECTIONS: tuple[Section, ...] = (
     "Safety",
     "Comfort",
     "Scores",
+    "Language model",
     "Traffic",
     "Own metrics",
 )

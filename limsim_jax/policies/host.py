@@ -231,7 +231,8 @@ class HostPolicy(Policy):
     - "meta": `meta`, `[B, E]`, whole numbers: `traffic.ego.Meta`, -1: like the traffic.
 
     With `memory` it is `function(seen, memory)` with an array `[B, E, memory]`, zeros at the start, and
-    returns the mapping and the new array.
+    returns the mapping and the new array. If it is `keyed`, its last argument is an array `[B, 2]` with the
+    random keys of the decisions, by which its notes are found again.
 
     Before anything is compiled, the function is tried on one empty straight road. An error there is a
     `ValueError` of one line; an exception of the function is named with its file and line. A world in which
@@ -246,6 +247,7 @@ class HostPolicy(Policy):
       observe: makes a pytree of arrays of one world: `(config, lane_map, state)`.
       samples: of a trajectory.
       dt: s between samples.
+      keyed: whether the function gets the keys of the decisions.
       failures: why it failed in this process, by the random key of the decision.
     """
 
@@ -255,6 +257,7 @@ class HostPolicy(Policy):
     observe: Callable[[Config, LaneMap, State], Any] = field(default_factory=Observe)
     samples: int = 41
     dt: float = 0.1
+    keyed: bool = False
     failures: dict[bytes, str] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -298,7 +301,7 @@ class HostPolicy(Policy):
         count = state.egos.slot.shape[0]
         seen = jax.eval_shape(lambda lane_map, state: self.observe(config, lane_map, state), lane_map, state)
         none = np.zeros((1, count, self.memory), np.float32)
-        self._call(_empty_road(seen), none, 1, count)
+        self._call(_empty_road(seen), none, np.zeros((1, 2), np.uint32), count)
         return jnp.zeros((count, self.memory), jnp.float32)
 
     def __call__(
@@ -348,17 +351,18 @@ class HostPolicy(Policy):
         if not alive.size:
             return found, kept
         shown = np.where(fine, np.arange(size), alive[0])
-        seen, memory = jax.tree.map(lambda x: x[shown], (asked.seen, asked.memory))
+        seen, memory, keys = jax.tree.map(lambda x: x[shown], (asked.seen, asked.memory, asked.key))
         try:
-            answer, remembered = self._call(seen, memory, size, count)
+            answer, remembered = self._call(seen, memory, keys, count)
             for name, x in answer.items():
                 found[name][alive] = x[alive]
             kept[alive] = remembered[alive]
         except ValueError:
             for k in map(int, alive):
                 try:
-                    seen, memory = jax.tree.map(lambda x: x[k : k + 1], (asked.seen, asked.memory))  # noqa: B023
-                    answer, kept[k : k + 1] = self._call(seen, memory, 1, count)
+                    one = asked.seen, asked.memory, asked.key
+                    seen, memory, keys = jax.tree.map(lambda x: x[k : k + 1], one)  # noqa: B023
+                    answer, kept[k : k + 1] = self._call(seen, memory, keys, count)
                 except ValueError as error:
                     self.failures[asked.key[k].tobytes()] = str(error)
                     continue
@@ -372,12 +376,13 @@ class HostPolicy(Policy):
         return {name: np.full((size, count, *rest), value, kind) for name, rest in self._fields().items()}
 
     def _call(
-        self, seen: Any, memory: Any, size: int, count: int
+        self, seen: Any, memory: Any, keys: np.ndarray, count: int
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Call the function for `size` worlds and check what it returns."""
+        """Call the function for the worlds of some keys; check what it returns."""
         name = getattr(self.function, "__qualname__", type(self.function).__qualname__)
+        given = [seen, *([memory] if self.memory else []), *([keys] if self.keyed else [])]
         try:
-            found = self.function(seen, memory) if self.memory else self.function(seen)
+            found = self.function(*given)
         except Exception as error:
             raise ValueError(f"{_where(error, name)}: {type(error).__name__}: {error}") from error
         if self.memory:
@@ -388,6 +393,7 @@ class HostPolicy(Policy):
             raise ValueError(f"{name}: returns {_what(found)}, not a mapping of {', '.join(self._fields())}")
         kind = np.int32 if self.command == "meta" else np.float32
         checked: dict[str, np.ndarray] = {}
+        size = len(keys)
         for field_, rest in self._fields().items():
             checked[field_] = _checked(name, field_, found[field_], (size, count, *rest), kind)
         shape = (size, count, self.memory)
@@ -408,12 +414,18 @@ def failure_reasons(policy: Any) -> dict[bytes, str]:
 
     By the random key of the decision."""
     found: dict[bytes, str] = {}
-    if isinstance(policy, HostPolicy):
-        found |= policy.failures
+    for one in planners(policy):
+        found |= one.failures
+    return found
+
+
+def planners(policy: Any) -> list[HostPolicy]:
+    """The planners on the host within a policy, each once."""
+    found = [policy] if isinstance(policy, HostPolicy) else []
     for value in vars(policy).values() if is_dataclass(policy) else ():
         for one in value if isinstance(value, tuple) else (value,):
             if is_dataclass(one) and not isinstance(one, type):
-                found |= failure_reasons(one)
+                found += [x for x in planners(one) if all(x is not y for y in found)]
     return found
 
 

@@ -26,6 +26,7 @@ from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.map import Map
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.xml import file_hash
+from limsim_jax.metrics.answers import LANGUAGE, METERED, language_columns
 from limsim_jax.metrics.catalog import TOTALS
 from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos, EvaluateTraffic
@@ -33,11 +34,13 @@ from limsim_jax.metrics.reductions import on_host
 from limsim_jax.policies.area import PARTS
 from limsim_jax.policies.base import PolicyLike, check_policy, knows, policy_name, views, with_scenery
 from limsim_jax.policies.host import failure_reasons
+from limsim_jax.policies.language.store import Answer
 from limsim_jax.policies.several import Several
 from limsim_jax.simulation.ending import Watch
 from limsim_jax.simulation.rollout import Result, Rollout, decision_key, world_key
 from limsim_jax.simulation.trace import trace
 from limsim_jax.simulation.worlds import Given, Worlds
+from limsim_jax.sweeps.answers import Notes, of_rows
 from limsim_jax.sweeps.build import (
     demand_of,
     doubts,
@@ -122,6 +125,7 @@ class Episodes:
         self._placed = script_vehicles(experiment, self.town, self._egos)
         self._script = script_of(experiment, self._as_read.network, self.town, self.egos)
         self._measure = self._measures(tuple(metrics))
+        self.notes = Notes(self._policy, experiment.dt)
         self.units = self._units()
         self._check_success()
         self._demand = demand_of(experiment, self.town, self._egos, drivers, self._placed)
@@ -240,6 +244,8 @@ class Episodes:
         units |= {total.name: total.meaning for total in TOTALS}
         if self._script is not None and self._script.actions is not None:
             units[_BEGUN] = "share of the actions of the experiment that have begun, lane changes started"
+        if self.notes.drivers and self.egos:
+            units |= {column.name: column.meaning for column in LANGUAGE}
         return units
 
     def _refuse(self, field: str, message: str) -> NoReturn:
@@ -341,20 +347,31 @@ class Episodes:
         """Run at most `chunk` worlds."""
         if len(seeds) > self.chunk:
             raise ValueError(f"{len(seeds)} seeds at once; at most {self.chunk}")
+        self.notes.forget()
         (_, result), *_ = self.worlds.chunks(seeds)
-        metrics = self._columns(result)
+        answers = self.notes.take(seeds)
+        metrics = self._columns(result, seeds, answers)
         each = max(self.egos, 1)
-        rows = np.repeat(np.asarray(seeds, np.int64), each)
-        egos = np.tile(np.arange(each, dtype=np.int32), len(seeds))
+        rows, egos = self._rows(seeds)
         return Outcome(
             seeds=rows,
             egos=egos,
             metrics=metrics,
             moments=key_moments(rows, egos, metrics, self._reasons(rows, metrics)),
             digest=digests(metrics, result.state, each),
+            answers=answers,
         )
 
-    def _columns(self, result: Result) -> dict[str, NDArray[np.float64]]:
+    def _rows(self, seeds: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Seed and ego of each row, `[W E]`."""
+        each = max(self.egos, 1)
+        return np.repeat(np.asarray(seeds, np.int64), each), np.tile(
+            np.arange(each, dtype=np.int32), len(seeds)
+        )
+
+    def _columns(
+        self, result: Result, seeds: Sequence[int], answers: Mapping[int, Sequence[Answer]]
+    ) -> dict[str, NDArray[np.float64]]:
         """Columns with a row per world and ego, `[W E]`."""
         found: dict[str, NDArray[np.float64]] = dict(on_host(result.measures))
         for column in TOTALS:
@@ -365,6 +382,8 @@ class Episodes:
             found[_BEGUN] = share_done(self._script.actions, progress)
         each = max(self.egos, 1)
         metrics = {name: x.ravel() if x.ndim == 2 else np.repeat(x, each) for name, x in found.items()}
+        if self.notes.drivers and self.egos:
+            metrics |= language_columns(of_rows(answers, *self._rows(seeds)))
         if self.experiment.success:
             sound = metrics["policy_failed"] == 0 if "policy_failed" in metrics else True
             metrics["success"] = succeeds(metrics, self.experiment.success) * sound
@@ -419,8 +438,10 @@ class Episodes:
     def _replayed(self, which: Sequence[tuple[int, int]], brief: bool) -> list[Replay]:
         """At most a chunk of replays."""
         enough = Watch([ego for _, ego in which], AFTERWARDS) if brief else None
+        self.notes.forget()
         result = self._reruns.replay([seed for seed, _ in which], enough)
-        columns = self._columns(result)
+        answers = self.notes.take([seed for seed, _ in which])
+        columns = self._columns(result, [seed for seed, _ in which], answers)
         found = []
         for k, (seed, ego) in enumerate(which):
             row = k * max(self.egos, 1) + ego
@@ -432,7 +453,8 @@ class Episodes:
             seen = jax.tree.map(lambda x: x[k], result.trace)  # noqa: B023
             values = {name: float(x[0]) for name, x in metrics.items()}
             slot = ego if self.egos else -1
-            found.append(Replay(self.network, self.lane_map, seen, slot, rows, values))
+            said = [x for x in answers.get(seed, ()) if x.ego == ego]
+            found.append(Replay(self.network, self.lane_map, seen, slot, rows, values, said))
         return found
 
     def _explain(self, seeds: Sequence[int], found: Sequence[Replay]) -> None:
@@ -531,7 +553,7 @@ def digests(metrics: Mapping[str, NDArray[np.float64]], state: Any, each: int) -
 
     It is the same for all `each` rows of a world."""
     leaves = [np.asarray(x) for x in jax.tree.leaves(state)]
-    columns = np.stack([metrics[name] for name in metrics], -1)
+    columns = np.stack([metrics[name] for name in metrics if name not in METERED], -1)
     columns = columns.reshape(-1, each, columns.shape[-1])
     digests = []
     for i in range(len(columns)):

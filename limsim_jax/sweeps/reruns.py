@@ -18,6 +18,7 @@ from limsim_jax.maps.network import Network
 from limsim_jax.metrics.reductions import on_host
 from limsim_jax.metrics.safety import Rss
 from limsim_jax.policies.base import Wrapper, sighted, variants
+from limsim_jax.policies.language.store import Answer
 from limsim_jax.policies.predict import Replayed, constant_velocity
 from limsim_jax.simulation.rollout import Result, Rollout, Started
 from limsim_jax.simulation.trace import Trace
@@ -38,6 +39,7 @@ class Replay(NamedTuple):
     ego: int  # slot; -1: a world without an ego
     moments: list[dict[str, Any]]
     metrics: dict[str, float]
+    answers: Sequence[Answer] = ()  # of a language model that drives the ego
 
 
 class Changed(NamedTuple):

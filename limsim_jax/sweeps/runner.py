@@ -28,7 +28,9 @@ from typing import Any, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 
+from limsim_jax.metrics.answers import METERED
 from limsim_jax.statistics import Interval, bootstrap, wilson
+from limsim_jax.sweeps.answers import check_seeds, recall
 from limsim_jax.sweeps.store import (
     NOT_COMPARED,
     DamagedError,
@@ -191,6 +193,8 @@ def sweep(
     _check(episodes, shard, until_ci, fresh)
     if on_error not in get_args(OnError):
         raise ValueError(f"on_error: '{on_error}'; known are {', '.join(get_args(OnError))}")
+    for one in episodes:
+        check_seeds(one, seeds)
     entries = [_entry(one) for one in episodes]
     register(out, entries, fresh=fresh)
     damaged: list[str] = []
@@ -481,7 +485,9 @@ def verify(results: Results, episodes: Sequence[Episodes], sample: int = 16, see
         one.compile()
         for first in range(0, rows.size, one.chunk):
             some = results.episodes.take(rows[first : first + one.chunk])
-            outcome = one.run(list(dict.fromkeys(some.column("seed").to_pylist())))
+            seeds = list(dict.fromkeys(some.column("seed").to_pylist()))
+            recall(one, results.path, seeds)
+            outcome = one.run(seeds)
             places = {
                 pair: i
                 for i, pair in enumerate(zip(outcome.seeds.tolist(), outcome.egos.tolist(), strict=True))
@@ -490,6 +496,8 @@ def verify(results: Results, episodes: Sequence[Episodes], sample: int = 16, see
                 i = places[row["seed"], row["ego"]]
                 what = ["digest"] * (row["digest"] != int(outcome.digest[i]))
                 for name, values in outcome.metrics.items():
+                    if name in METERED:
+                        continue
                     value = None if np.isnan(values[i]) else float(values[i])
                     what += [name] * (row.get(name) != value)
                 if what:

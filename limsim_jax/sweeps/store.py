@@ -3,6 +3,7 @@
     OUT/results.json                                          what the directory holds, and how it was made
     OUT/<scenario>/<policy>/moments-<first>-<last>.parquet    key moments of a chunk of seeds
     OUT/<scenario>/<policy>/episodes-<first>-<last>.parquet   its rows; once this is there, the chunk is done
+    OUT/answers/<scenario>/<policy>/<seed>.jsonl              what a language model said, see `sweeps.answers`
 
 `<first>` and `<last>` are the least and the largest seed; a chunk with gaps between has a checksum of its
 seeds behind them. Every file carries its provenance and a SHA-256 of all that it says, so a changed byte is
@@ -25,6 +26,7 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +35,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from limsim_jax.files import write_whole
+from limsim_jax.policies.language.store import Answer, lines_of
+from limsim_jax.sweeps.answers import FOLDER, answers_file
 
 FORMAT = 2
 """Version of the layout of a results directory."""
@@ -106,6 +110,7 @@ class Outcome(NamedTuple):
     moments: Mapping[str, NDArray[Any]]
     """Columns of `MOMENTS` [M], without scenario and policy. None, NaN, "" or a negative `other`: null."""
     digest: NDArray[np.uint64]  # [R], of the rows and the final state of the world
+    answers: Mapping[int, Sequence[Answer]] = MappingProxyType({})  # of a language model, by seed
 
 
 @dataclass(frozen=True)
@@ -309,6 +314,9 @@ def _remove(path: Path, entries: Sequence[Entry]) -> None:
             for file in sorted((path / entry.scenario / entry.policy).glob(f"{kind}-*.parquet")):
                 with _clear(file), contextlib.suppress(FileNotFoundError):
                     file.unlink()
+        for file in sorted((path / FOLDER / entry.scenario / entry.policy).glob("*.jsonl")):
+            with _clear(file), contextlib.suppress(FileNotFoundError):
+                file.unlink()
 
 
 def _listed(path: Path) -> Iterator[Entry]:
@@ -401,13 +409,18 @@ class Shards:
         self.folder = path / entry.scenario / entry.policy
 
     def write(self, outcome: Outcome) -> Path:
-        """Keep a chunk: moments first, for the file of episodes says that all is there.
+        """Keep a chunk: episodes last, for their file says that all is there.
 
         Raises:
           ResultsError: it cannot be written (disk full, no permission). What was finished stays.
         """
         name = _stem(np.unique(np.asarray(outcome.seeds, np.int64)))
         about = _about(self.entry)
+        for seed, answers in outcome.answers.items():
+            file = answers_file(self.path, self.entry.scenario, self.entry.policy, seed)
+            with _clear(file):
+                file.parent.mkdir(parents=True, exist_ok=True)
+            _write(file, lines_of(answers).encode())
         _write(self.folder / f"moments-{name}.parquet", _encode(_moments(self.entry, outcome), about))
         path = self.folder / f"episodes-{name}.parquet"
         _write(path, _encode(_episodes(self.entry, outcome), about))

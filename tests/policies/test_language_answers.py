@@ -1,33 +1,46 @@
 """Language drivers without an engine: descriptions, answers, faults of servers, cache, caps, time."""
 
+import base64
 import importlib.util
+import io
 import json
+from dataclasses import replace
 from typing import Any
 
 import chat_server as stub
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
+from limsim_jax import cli
+from limsim_jax.bridges.chat.faults import FAULTS, always
+from limsim_jax.bridges.chat.replies import decision, error
+from limsim_jax.bridges.chat.server import ChatServer
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.policies.base import policy_name
 from limsim_jax.policies.host import FAR
 from limsim_jax.policies.language import answers, memory
 from limsim_jax.policies.language.answers import CallStatus, Reply, parse
 from limsim_jax.policies.language.describe import (
+    LIMSIM_PP,
     MOST_TOKENS,
     PLAIN,
     STYLES,
     available,
     description,
     token_bound,
+    worked_example,
 )
 from limsim_jax.policies.language.driver import LanguageDriver, language
+from limsim_jax.policies.language.reading import read_description
 from limsim_jax.policies.language.rules import rule_action
-from limsim_jax.policies.language.scene import NONE, Facts, Neighbour
+from limsim_jax.policies.language.scene import NONE, Facts, Neighbour, facts_of, numbers
 from limsim_jax.policies.language.store import read_answers, shares
 from limsim_jax.policies.registry import POLICIES
+from limsim_jax.sensors.rig import Lidar, Rig
 from limsim_jax.traffic.ego import Meta
 
+LIDAR_ONLY = Rig(lidar=Lidar())
 needs_httpx = pytest.mark.skipif(importlib.util.find_spec("httpx") is None, reason="needs httpx")
 OFFERED = {action: action.name for action in Meta}
 
@@ -54,7 +67,8 @@ def test_a_description_tells_all_facts_in_few_tokens():
         told = some_facts(rng)
         for style in STYLES.values():
             assert token_bound(description(style, told)) <= MOST_TOKENS
-        read = stub.read_description(description(PLAIN, told))
+        assert facts_of(numbers(told)) == told
+        read = read_description(description(PLAIN, told))[0]
         assert (read.light, read.to_go, read.left, read.right) == (
             told.light,
             told.to_go,
@@ -133,7 +147,7 @@ def scene(worlds=1, time=0.0):
 
 
 def drive(server, worlds=1, times=(0.0,), **options):
-    options = {"server": server.url, "model": "model", "timeout": 1.5, "check": False} | options
+    options = {"server": server.url, "model": "model", "timeout": 30.0, "check": False} | options
     driver = language(**options).function
     assert isinstance(driver, LanguageDriver)
     memory, found = np.zeros((worlds, 1, 6), np.float32), []
@@ -143,59 +157,47 @@ def drive(server, worlds=1, times=(0.0,), **options):
     return found, driver
 
 
-TRUNCATED = stub.chat('{"reason": "the car ahe', finish="length")
-KEEP = stub.decision("DECELERATE")
-FAULTS = {
-    "fine": (stub.always(KEEP), "ok", Meta.DECELERATE, 1),
-    "image to a text model": (
-        stub.always(stub.error(500, "image input is not supported, mmproj")), "http", None, 1,
-    ),
-    "no response_format": (
-        lambda request, _: KEEP if "response_format" not in request
-        else stub.error(400, "response_format type must be one of text"), "ok", Meta.DECELERATE, 3,
-    ),
-    "only json_object": (
-        lambda request, _: KEEP if request["response_format"]["type"] == "json_object"
-        else stub.error(400, "Unable to generate parser for this template"), "ok", Meta.DECELERATE, 2,
-    ),
-    "only max_tokens": (
-        lambda request, _: KEEP if "max_tokens" in request
-        else stub.error(400, "unknown field max_completion_tokens"), "ok", Meta.DECELERATE, 2,
-    ),
-    "prompt too long": (
-        stub.always(stub.error(400, "long", type="exceed_context_size_error", n_ctx=512)), "http", None, 1,
-    ),
-    "bad request": (stub.always(stub.error(400, "n must be 1")), "http", None, 1),
-    "not supported": (stub.always(stub.error(501, "off", type="not_supported_error")), "http", None, 1),
-    "truncated": (stub.always(TRUNCATED), "truncated", Meta.KEEP, 2),
-    "truncated, then fine": (stub.first(TRUNCATED, KEEP), "repaired", Meta.DECELERATE, 2),
-    "illegal, then fine": (stub.first(stub.chat("hm"), KEEP), "repaired", Meta.DECELERATE, 2),
-    "lane that is not there": (stub.always(stub.decision("RIGHT")), "illegal", Meta.KEEP, 2),
-    "hang": (stub.always(stub.hang), "timeout", None, 1),
-    "hang up": (stub.first(stub.hang_up, KEEP), "ok", Meta.DECELERATE, 2),
-    "429 in seconds": (stub.first(stub.limited("0"), KEEP), "ok", Meta.DECELERATE, 2),
-    "429 by a date": (stub.first(stub.limited(stub.date_now()), KEEP), "ok", Meta.DECELERATE, 2),
-    "429 for long": (stub.always(stub.limited("60")), "http", None, 1),
-    "no retry": (stub.always((503, {}, {"x-should-retry": "false"})), "http", None, 1),
-    "HTML 502": (stub.always((502, "<html>bad gateway</html>", {"retry-after-ms": "1"})), "http", None, 3),
-    "HTML 200": (stub.always((200, "<html>hello</html>", {})), "http", None, 1),
-    "no choices": (stub.always({"choices": []}), "http", None, 1),
-    "refusal": (stub.always(stub.chat(None, refusal="I will not drive")), "refused", Meta.KEEP, 1),
-    "filter": (stub.always(stub.chat("", finish="content_filter")), "refused", Meta.KEEP, 1),
-    "tool": (stub.always(stub.chat(None, "tool_calls", tool_calls=[{"id": "1"}])), "illegal", Meta.KEEP, 2),
-    "split UTF-8": (stub.always(stub.in_pieces(stub.chat("Übermäßig → STOP"))), "ok", Meta.STOP, 1),
-    "wrong key": (stub.always(stub.error(401, f"Incorrect key {stub.KEY}")), "http", None, 1),
-    "no model": (stub.always(stub.error(404, "model not found")), "http", None, 1),
-}  # fmt: skip
+SLOWER = decision("DECELERATE")
+ENDS = {
+    "fine": ("ok", Meta.DECELERATE, 1),
+    "image to a text model": ("http", None, 1),
+    "no response_format": ("ok", Meta.DECELERATE, 3),
+    "only json_object": ("ok", Meta.DECELERATE, 2),
+    "only max_tokens": ("ok", Meta.DECELERATE, 2),
+    "prompt too long": ("http", None, 1),
+    "bad request": ("http", None, 1),
+    "not supported": ("http", None, 1),
+    "truncated": ("truncated", Meta.KEEP, 2),
+    "truncated, then fine": ("repaired", Meta.DECELERATE, 2),
+    "illegal, then fine": ("repaired", Meta.DECELERATE, 2),
+    "lane that is not there": ("illegal", Meta.KEEP, 2),
+    "hang": ("timeout", None, 1),
+    "hang up": ("ok", Meta.DECELERATE, 2),
+    "429 in seconds": ("ok", Meta.DECELERATE, 2),
+    "429 by a date": ("ok", Meta.DECELERATE, 2),
+    "429 for long": ("http", None, 1),
+    "no retry": ("http", None, 1),
+    "HTML 502": ("http", None, 3),
+    "HTML 200": ("http", None, 1),
+    "no choices": ("http", None, 1),
+    "refusal": ("refused", Meta.KEEP, 1),
+    "filter": ("refused", Meta.KEEP, 1),
+    "tool": ("illegal", Meta.KEEP, 2),
+    "split UTF-8": ("ok", Meta.STOP, 1),
+    "wrong key": ("http", None, 1),
+    "no model": ("http", None, 1),
+}
+"""Status, action (None: that of the rules) and calls after each fault."""
 
 
 @needs_httpx
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_ends_in_an_action_and_a_status(name, tmp_path, monkeypatch):
     monkeypatch.setenv("OPENAI_API_KEY", stub.KEY)
-    script, status, action, calls = FAULTS[name]
-    with stub.serving(script) as server:
-        found, driver = drive(server, log=str(tmp_path / "log.jsonl"), cache=str(tmp_path / "cache.db"))
+    status, action, calls = ENDS[name]
+    with stub.serving(FAULTS[name]) as server:
+        files: dict[str, Any] = {"log": str(tmp_path / "log.jsonl"), "cache": str(tmp_path / "cache.db")}
+        found, driver = drive(server, timeout=1.0 if name == "hang" else 30.0, **files)
         assert len(server.requests) == calls
     (answer,) = driver.log.answers
     assert (answer.status, answer.calls) == (status, calls)
@@ -217,7 +219,7 @@ def test_malformed_answers_never_raise():
 @needs_httpx
 def test_reruns_from_the_cache_are_equal_without_a_server(tmp_path):
     times, cache = (0.0, 0.5, 1.0), str(tmp_path / "cache.db")
-    script = lambda _, number: stub.decision(["KEEP", "STOP", "LEFT"][number % 3])  # noqa: E731
+    script = lambda _, number: decision(["KEEP", "STOP", "LEFT"][number % 3])  # noqa: E731
     with stub.serving(script) as server:
         before, _ = drive(server, 5, times, cache=cache)
         asked = len(server.requests)
@@ -233,7 +235,7 @@ def test_reruns_from_the_cache_are_equal_without_a_server(tmp_path):
 
 @needs_httpx
 def test_caps_hold_and_the_rules_drive_on():
-    with stub.serving(stub.always(KEEP)) as server:
+    with stub.serving(always(SLOWER)) as server:
         found, driver = drive(server, worlds=4, max_calls=5, retries=0)
         assert len(server.requests) == 2, "a question may need a repair"
         assert found == [[Meta.DECELERATE] * 2 + [Meta.ACCELERATE] * 2]
@@ -248,11 +250,16 @@ def test_caps_hold_and_the_rules_drive_on():
 @needs_httpx
 @pytest.mark.parametrize(
     ("latency", "slow_at"),
-    [(0.0, [0, 0.5, 1, 1.5, 2, 2.5, 3]), (0.5, [0.5, 1, 1.5, 2, 2.5, 3]), (2.0, [2, 2.5])],
+    [
+        (None, [0, 0.5, 1, 1.5, 2, 2.5, 3]),
+        (0.0, [0, 0.5, 1, 1.5, 2, 2.5, 3]),
+        (0.5, [0.5, 1, 1.5, 2, 2.5, 3]),
+        (2.0, [2, 2.5]),
+    ],
 )
 def test_an_answer_counts_after_its_latency_for_one_period(latency, slow_at):
     times = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
-    with stub.serving(stub.always(KEEP)) as server:
+    with stub.serving(always(SLOWER)) as server:
         found, _ = drive(server, 1, times, latency=latency)
     assert [
         time for time, (action,) in zip(times, found, strict=True) if action == Meta.DECELERATE
@@ -263,7 +270,7 @@ def test_an_answer_counts_after_its_latency_for_one_period(latency, slow_at):
 @needs_httpx
 def test_a_graph_of_questions_is_recorded():
     with stub.serving(
-        lambda request, _: KEEP if "response_format" in request else stub.chat("A bus.")
+        lambda request, _: SLOWER if "response_format" in request else stub.chat("A bus.")
     ) as server:
         found, driver = drive(server, graph=True)
         assert found == [[Meta.DECELERATE]]
@@ -275,13 +282,15 @@ def test_a_graph_of_questions_is_recorded():
 @needs_httpx
 def test_memories_of_failures_are_shown_and_never_of_tests(tmp_path):
     told = [some_facts(np.random.default_rng(k)) for k in range(3)]
-    with stub.serving(stub.always(KEEP)) as server:
+    with stub.serving(always(SLOWER)) as server:
         _, driver = drive(server)
-        failed = [driver.log.answers[0]] * 3
-        learnt = driver.reflect(told, failed, seed=4)
+        first = driver.log.answers[0]
+        assert description(PLAIN, facts_of(first.facts)) == first.scene
+        failed = [replace(first, scene=description(PLAIN, x), facts=numbers(x)) for x in told]
+        learnt = driver.reflect(failed, seed=4)
         assert len(learnt) == 3
         with pytest.raises(ValueError, match="seed 5: odd seeds are for tests"):
-            driver.reflect(told, failed, seed=5)
+            driver.reflect(failed, seed=5)
         memory.write_memories(tmp_path / "m.jsonl", learnt)
         assert memory.similar(learnt, told[1], 1)[0].scene == description(PLAIN, told[1])
         drive(server, memory=str(tmp_path / "m.jsonl"), shots=2)
@@ -293,28 +302,51 @@ def test_memories_of_failures_are_shown_and_never_of_tests(tmp_path):
 
 
 @needs_httpx
+def test_the_order_of_limsim_pp_has_a_worked_example_that_is_right():
+    told, offered = read_description(worked_example(LIMSIM_PP)[0])
+    answered = parse(Reply(worked_example(LIMSIM_PP)[1]), offered)
+    assert answered == (CallStatus.OK, rule_action(told)) == (CallStatus.OK, Meta.DECELERATE)
+    with stub.serving(always(stub.chat("#### 2"))) as server:
+        found, _ = drive(server, style="limsim_pp")
+        roles = [x["role"] for x in server.requests[-1]["messages"]]
+    assert (found, roles) == ([[Meta.DECELERATE]], ["system", "user", "assistant", "user"])
+
+
+@needs_httpx
 def test_pictures_are_sent_as_png():
-    with stub.serving(stub.always(stub.chat("## Decision\nDeceleration"))) as server:
-        options = {"style": "limsim_pp_vision", "images": lambda scene, ego: [b"\x89PNG one", b"\x89PNG two"]}
-        found, _ = drive(server, **options)
-        assert found == [[Meta.DECELERATE]]
-        parts = server.requests[0]["messages"][-1]["content"]
-        assert [x["type"] for x in parts] == ["image_url", "image_url", "text"]
-        assert parts[0]["image_url"]["url"].startswith("data:image/png;base64,")
+    rng = np.random.default_rng(0)
+    pictures = rng.integers(0, 256, (1, 1, 3, 6, 8, 3), np.uint8)
+    with stub.serving(always(stub.chat("## Decision\nDeceleration"))) as server:
+        policy = language(server.url, "model", style="limsim_pp_vision")
+        assert policy.needs_scenery and len(policy.observe.rig.cameras) == 3  # pyright: ignore
+        seen = scene()._replace(pictures=pictures)
+        command, _ = policy.function(seen, np.zeros((1, 1, 6), np.float32))
+        assert command["meta"].tolist() == [[Meta.DECELERATE]]
+        parts = server.requests[-1]["messages"][-1]["content"]
+    assert [x["type"] for x in parts] == ["text"] * 2 + ["image_url"] * 3 + ["text"]
+    assert "these cameras: front_left, front, front_right" in parts[1]["text"]
+    for part, picture in zip(parts[2:], pictures[0, 0], strict=False):
+        head, data = part["image_url"]["url"].split(",")
+        assert head == "data:image/png;base64"
+        read = plt.imread(io.BytesIO(base64.b64decode(data)), format="png")
+        np.testing.assert_array_equal(np.round(read * 255), picture)
+    assert not language(server.url, "model", check=False).needs_scenery
 
 
 @needs_httpx
 def test_bad_input_is_one_line_before_anything_runs(monkeypatch):
     monkeypatch.setenv("OPENAI_API_KEY", "sk-wrong")
     make: Any = language
-    no_images = stub.error(500, "image input is not supported")
-    with stub.serving(stub.always(no_images)) as server:
+    no_images = error(500, "image input is not supported")
+    with stub.serving(always(no_images)) as server:
         options = {"server": server.url, "model": "model"}
         cases = [
             ({"model": "gpt-9"}, "model: 'gpt-9' is unknown to http.*; it has model"),
             ({"style": "haiku"}, "style: 'haiku'; known are plain, limsim_pp"),
-            ({"style": "limsim_pp_vision"}, "needs images of cameras"),
-            ({"style": "limsim_pp_vision", "images": lambda *_: []}, "model: 'model' takes no images"),
+            ({"style": "limsim_pp_vision"}, "model: 'model' takes no images"),
+            ({"cameras": "front"}, "model: 'model' takes no images"),
+            ({"cameras": "roof"}, "cameras: 'roof'; known are front, three, six"),
+            ({"cameras": LIDAR_ONLY}, "cameras: the rig has none"),
             ({"server": "localhost:80"}, "server: 'localhost:80'; expected a URL"),
             ({"server": "http://user:sk-wrong@host/v1"}, "no key in the URL"),
             ({"latency": -1.0}, "latency -1.0 s"),
@@ -341,3 +373,21 @@ def test_it_has_a_name():
     assert json.dumps([x.value for x in CallStatus]) == json.dumps(
         ["ok", "repaired", "illegal", "truncated", "refused", "timeout", "http", "fallback"]
     )
+
+
+@needs_httpx
+def test_the_server_of_the_command_line(capsys, monkeypatch):
+    """It serves the models that it names, until it is stopped."""
+    served = []
+    monkeypatch.setattr(ChatServer, "wait", lambda self: served.append(self))
+    monkeypatch.setenv("MY_KEY", stub.KEY)
+    assert cli.main(["serve", "chat", "--model", "rules", "--port", "0", "--key-variable", "MY_KEY"]) == 0
+    (server,) = served
+    assert capsys.readouterr().out == f"listening on {server.url}, models: rules\n"
+    with server:
+        found, _ = drive(server, model="rules", key_variable="MY_KEY")
+        assert found == [[Meta.ACCELERATE]], "as the rules in JAX"
+    wrong = {"--model=gpt": "'gpt'; known are rules, faults", "--key-variable=NO": "$NO is empty"}
+    for change, text in wrong.items():
+        assert cli.main(["serve", "chat", change]) == 2
+        assert text in capsys.readouterr().err

@@ -259,11 +259,19 @@ def image_part(png: bytes) -> dict[str, Any]:
     return {"type": "image_url", "image_url": {"url": f"data:image/png;base64,{data}", "detail": "low"}}
 
 
-def message(role: str, text: str, images: Sequence[bytes] = ()) -> dict[str, Any]:
-    """A message; with pictures, its content is a list of parts."""
-    if not images:
+def message(role: str, text: str, images: Sequence[bytes] = (), before: Sequence[str] = ()) -> dict[str, Any]:
+    """A message; with pictures, its content is a list of parts.
+
+    Args:
+      role: "system", "user" or "assistant".
+      text: the last part.
+      images: PNG pictures.
+      before: texts ahead of them.
+    """
+    if not images and not before:
         return {"role": role, "content": text}
-    return {"role": role, "content": [*map(image_part, images), {"type": "text", "text": text}]}
+    first, last = ([{"type": "text", "text": x} for x in texts] for texts in (before, (text,)))
+    return {"role": role, "content": [*first, *map(image_part, images), *last]}
 
 
 def _backoff(tries: int) -> float:

@@ -22,7 +22,7 @@ MOST_TOKENS = 350
 
 Form = Literal["json", "hashes", "decision"]
 
-_MEANS = {
+MEANS = {
     Meta.KEEP: "hold the speed",
     Meta.ACCELERATE: "drive faster",
     Meta.DECELERATE: "brake gently",
@@ -30,6 +30,7 @@ _MEANS = {
     Meta.RIGHT: "change to the lane on the right",
     Meta.STOP: "brake to a standstill",
 }
+"""Actions in words."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ class Style:
       temperature: of the sampling.
       max_tokens: of an answer.
       timeout: s, of a whole call.
-      images: whether pictures stand for the list of vehicles.
+      images: whether pictures stand for the list of vehicles, and all is said in one message.
+      example: whether a worked example comes before the scene.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Style:
     max_tokens: int = 160
     timeout: float = 20.0
     images: bool = False
+    example: bool = False
 
 
 PLAIN = Style("plain", {action: action.name for action in Meta})
@@ -65,6 +68,7 @@ LIMSIM_PP = Style(
     form="hashes",
     max_tokens=2000,
     timeout=60.0,
+    example=True,
 )
 LIMSIM_PP_VISION = Style(
     "limsim_pp_vision",
@@ -146,6 +150,22 @@ def description(style: Style, told: Facts) -> str:
     return text if style.name == DILU.name else f"{text}\nNavigation hint:\n{_route(told)}"
 
 
+def worked_example(style: Style) -> tuple[str, str]:
+    """A scene and the right answer to it."""
+    none = Neighbour(NONE, 0.0)
+    told = Facts(
+        v=14.0, limit=16.7, ahead=Neighbour(18.0, 8.0), left_ahead=none, left_behind=none, right_ahead=none,
+        right_behind=none, light=int(SignalState.OFF), light_distance=FAR, to_go=0, to_go_within=0.0,
+        left=False, right=False,
+    )  # fmt: skip
+    closing = told.v - told.ahead.v
+    reason = (
+        f"The vehicle ahead is {_number(told.ahead.gap)} m away and {_number(closing)} m/s slower, a TTC of "
+        f"{_number(told.ahead.gap / closing)} s. There is no other lane. I brake gently."
+    )
+    return description(style, told), f"{reason}\n#### {style.labels[Meta.DECELERATE]}"
+
+
 def token_bound(text: str) -> int:
     """Tokens of a text, estimated from above: each digit, mark and piece of four letters counts."""
     words = re.findall(r"[A-Za-z]+|[^A-Za-z\s]", text)
@@ -153,7 +173,7 @@ def token_bound(text: str) -> int:
 
 
 def _means(action: Meta) -> str:
-    return _MEANS[action]
+    return MEANS[action]
 
 
 def _own(told: Facts) -> str:
@@ -208,7 +228,7 @@ def _intention(told: Facts) -> str:
 
 
 def _plain_offer(offered: Mapping[Meta, str]) -> str:
-    return "Actions: " + "; ".join(f"{label} = {_MEANS[action]}" for action, label in offered.items()) + "."
+    return "Actions: " + "; ".join(f"{label} = {MEANS[action]}" for action, label in offered.items()) + "."
 
 
 def _number(value: Any) -> str:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import asyncio
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,18 +21,25 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from limsim_jax.policies.host import HostPolicy
+from limsim_jax.policies.host import HostPolicy, planners
 from limsim_jax.policies.language.answers import SILENT, CallStatus, Reply, parse, schema
 from limsim_jax.policies.language.chat import Chat, Outcome, Server, load_httpx, message
-from limsim_jax.policies.language.describe import PLAIN, STYLES, Style, available, description, role
+from limsim_jax.policies.language.describe import (
+    PLAIN,
+    STYLES,
+    Style,
+    available,
+    description,
+    role,
+    worked_example,
+)
 from limsim_jax.policies.language.memory import Memory, features, read_memories, similar
+from limsim_jax.policies.language.pictures import png, rig_of
 from limsim_jax.policies.language.rules import between, is_due, rule_action
-from limsim_jax.policies.language.scene import Facts, LookAround, Scene, facts
+from limsim_jax.policies.language.scene import Facts, LookAround, Scene, facts, facts_of, numbers
 from limsim_jax.policies.language.store import Answer, Cache, Log, request_hash
+from limsim_jax.sensors.rig import Rig
 from limsim_jax.traffic.ego import Meta
-
-Images = Callable[[Any, int], Sequence[bytes]]
-"""PNG pictures of the cameras of an ego: `(scene of one world, row of the ego)`."""
 
 GRAPH = {
     "scene": "Describe in two sentences what matters in this scene.",
@@ -39,6 +48,7 @@ GRAPH = {
 }
 """Questions before that for the action, in order."""
 
+_PAIR = ("user", "assistant")
 _SEED = 0  # of the sampling
 _MEMORY = 6  # asked before, time of the last question, action, its time, 1 + coming action, its time
 
@@ -61,6 +71,10 @@ class Caps:
     prompt_price: float = 0.0
     answer_price: float = 0.0
 
+    def price(self, prompt_tokens: int, answer_tokens: int) -> float:
+        """Cost of tokens."""
+        return (prompt_tokens * self.prompt_price + answer_tokens * self.answer_price) / 1e6
+
 
 class _Spent:
     """What a run has used."""
@@ -78,14 +92,23 @@ class _UnknownReply(Exception):
 class _Question(NamedTuple):
     key: str
     told: Facts
+    text: str
     messages: list[dict[str, Any]]
     offered: dict[Meta, str]
+
+
+class _Step(NamedTuple):
+    node: str
+    status: CallStatus
+    text: str
+    error: str
+    outcome: Outcome
 
 
 class _Said(NamedTuple):
     status: CallStatus
     action: Meta | None
-    steps: list[tuple[str, str, CallStatus, str, str, Outcome]]  # node, hash, status, text, error, outcome
+    steps: list[_Step]
 
 
 @dataclass(frozen=True)
@@ -96,38 +119,42 @@ class LanguageDriver:
       server: where the model is asked.
       style: protocol.
       period: s between questions; None: that of the style.
-      latency: s after which an answer counts, for one period; 0: the world waits. Without an answer that
-        counts the speed is kept.
+      latency: s after which an answer counts, for one period, and until which the speed is kept; None: the
+        world waits for it.
       graph: whether `GRAPH` is asked before the action.
       memories: examples; the `shots` most similar ones are shown.
       shots: most examples.
-      images: pictures of the cameras.
+      cameras: names of those whose pictures are sent.
       caps: of calls, tokens and cost.
       asked_of: server and model, of which rows depend.
       cache: of replies.
       log: of answers.
+      notes: answers by the key of the decision, for results.
+      told: answers that are taken again if the question is the same, by key and ego.
     """
 
     server: Server
     style: Style = PLAIN
     period: float | None = None
-    latency: float = 0.0
+    latency: float | None = None
     graph: bool = False
     memories: tuple[Memory, ...] = ()
     shots: int = 3
-    images: Images | None = None
+    cameras: tuple[str, ...] = ()
     caps: Caps = Caps()
     cache: Cache = field(default_factory=lambda: Cache(None), compare=False, repr=False)
     log: Log = field(default_factory=lambda: Log(None), compare=False, repr=False)
+    notes: dict[bytes, list[Answer]] = field(default_factory=dict, init=False, compare=False, repr=False)
+    told: dict[tuple[bytes, int], list[Answer]] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
     asked_of: tuple[str, ...] = field(init=False, repr=False)
     _chat: Chat = field(init=False, compare=False, repr=False)
     _spent: _Spent = field(default_factory=_Spent, init=False, compare=False, repr=False)
     _lock: Any = field(default_factory=threading.Lock, init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.style.images and self.images is None:
-            raise ValueError(f"style: '{self.style.name}' needs images of cameras; set images")
-        if not self.latency >= 0 or not (self.period is None or self.period > 0):
+        if not (self.latency is None or self.latency >= 0) or not (self.period is None or self.period > 0):
             raise ValueError(
                 f"latency {self.latency} s, period {self.period} s; expected 0 or more, and more than 0"
             )
@@ -139,7 +166,9 @@ class LanguageDriver:
         """The client of the server."""
         return self._chat
 
-    def __call__(self, scene: Scene, memory: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    def __call__(
+        self, scene: Scene, memory: np.ndarray, keys: np.ndarray | None = None
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Actions `[B, E]` and the new memory, see `HostPolicy`."""
         before, last, held, since, coming, arrival = np.moveaxis(np.array(memory), -1, 0)
         time = np.broadcast_to(np.asarray(scene.seen.time)[:, None], last.shape)
@@ -154,51 +183,87 @@ class LanguageDriver:
         there = np.asarray(scene.seen.length) > 0  # not in the trial of `HostPolicy`
         due = there & (coming == 0) & ((before == 0) | is_due(time, last, period))
         if due.any():
-            actions = self._decide(scene, due, time)
+            actions = self._decide(scene, due, time, keys)
             before, last = np.where(due, 1, before), np.where(due, time, last)
-            coming, arrival = np.where(due, 1 + actions, coming), np.where(due, time + self.latency, arrival)
-            held, since, coming = arrive()
+            if self.latency is None:
+                held, since = np.where(due, actions, held), np.where(due, time, since)
+            else:
+                coming = np.where(due, 1 + actions, coming)
+                arrival = np.where(due, time + self.latency, arrival)
+                held, since, coming = arrive()
         kept = np.stack([before, last, held, since, coming, arrival], -1).astype(np.float32)
         return {"meta": held.astype(np.int32)}, kept
 
     # --- questions
 
-    def _decide(self, scene: Scene, due: np.ndarray, time: np.ndarray) -> np.ndarray:
+    def _decide(self, scene: Scene, due: np.ndarray, time: np.ndarray, keys: np.ndarray | None) -> np.ndarray:
         """The actions of egos whose question is due; equal questions are asked once."""
         told = facts(scene)
         rules = rule_action(told)
+        names = [b"" if keys is None else key.tobytes() for key in (due if keys is None else keys)]
         rows: dict[str, list[tuple[int, int]]] = {}
         questions: dict[str, _Question] = {}
+        actions = np.zeros(due.shape, int)
+        answers: dict[tuple[int, int], list[Answer]] = {}
         for world, ego in map(tuple, np.argwhere(due).tolist()):
             question = self._question(scene, jax.tree.map(lambda x: x[world, ego].item(), told), world, ego)  # noqa: B023
+            before = self.told.get((names[world], ego), [])
+            if before and before[-1].prompt == question.key:
+                answers[world, ego] = [replace(x, world=world) for x in before]
+                actions[world, ego] = Meta[before[-1].action]
+                continue
             rows.setdefault(question.key, []).append((world, ego))
             questions.setdefault(question.key, question)
         with self._lock:
-            said = self._answers(list(questions.values()))
-            actions = np.zeros(due.shape, int)
-            answers: list[Answer] = []
-            for key, found in said.items():
+            for key, found in self._answers(list(questions.values())).items():
                 for k, (world, ego) in enumerate(rows[key]):
-                    silent = found.status in SILENT
                     action = found.action
                     if action is None:
-                        action = Meta(int(rules[world, ego])) if silent else Meta.KEEP
+                        action = Meta(int(rules[world, ego])) if found.status in SILENT else Meta.KEEP
                     actions[world, ego] = action
                     moment = world, ego, round(float(time[world, ego]), 3)
-                    answers += [_answer(*moment, *step, action=action, first=k == 0) for step in found.steps]
-            self.log.add(sorted(answers, key=lambda x: (x.world, x.ego)))
+                    steps = [self._answer(questions[key], moment, x, action, k == 0) for x in found.steps]
+                    answers[world, ego] = steps
+            self.log.add(x for row in sorted(answers) for x in answers[row])
+            if keys is not None:
+                self.notes.update({names[world]: [] for world, _ in answers})
+                for (world, ego), steps in sorted(answers.items()):
+                    mine = self.notes[names[world]]
+                    mine += steps if all(x.ego != ego for x in mine) else []
         return actions
+
+    def _answer(
+        self, question: _Question, moment: tuple[int, int, float], step: _Step, action: Meta, first: bool
+    ) -> Answer:
+        """How a step ended; calls count for the first of equal questions."""
+        outcome, asked = step.outcome, first and step.outcome.calls > 0
+        reply = outcome.reply if asked and outcome.reply is not None else Reply("")
+        decides = step.node == "action"
+        return Answer(
+            *moment, step.node, question.key, step.status, action.name, step.text, step.error,
+            latency=round(outcome.latency, 4) if asked else 0.0,
+            calls=outcome.calls if asked else 0,
+            prompt_tokens=reply.prompt_tokens,
+            answer_tokens=reply.answer_tokens,
+            cost=self.caps.price(reply.prompt_tokens, reply.answer_tokens),
+            scene=question.text if decides else "",
+            facts=numbers(question.told) if decides else (),
+        )  # fmt: skip
 
     def _question(self, scene: Scene, told: Facts, world: int, ego: int) -> _Question:
         text, offered = description(self.style, told), available(self.style, told)
-        images = ()
-        if self.images is not None:
-            images = tuple(self.images(jax.tree.map(lambda x: x[world], scene), ego))
-        messages = [message("system", role(self.style))]
-        for example in similar(self.memories, told, self.shots):
-            messages += [message("user", example.scene), message("assistant", example.answer)]
-        messages.append(message("user", text, images))
-        return _Question(request_hash({"messages": messages, **self._settings()}), told, messages, offered)
+        pictures = () if scene.pictures is None else scene.pictures[world, ego]
+        images = [png(np.asarray(picture)) for picture in pictures]
+        pairs = [worked_example(self.style)] if self.style.example else []
+        pairs += [(x.scene, x.answer) for x in similar(self.memories, told, self.shots)]
+        shown = [message(who, said) for pair in pairs for who, said in zip(_PAIR, pair, strict=True)]
+        if self.style.images:  # one message that holds all
+            cameras = f"The next {len(images)} pictures are of these cameras: {', '.join(self.cameras)}."
+            messages = [*shown, message("user", text, images, before=(role(self.style), cameras))]
+        else:
+            messages = [message("system", role(self.style)), *shown, message("user", text, images)]
+        key = request_hash({"messages": messages, **self._settings()})
+        return _Question(key, told, text, messages, offered)
 
     def _settings(self) -> dict[str, Any]:
         return {
@@ -232,7 +297,7 @@ class LanguageDriver:
                 found |= {x.key: said for x, said in zip(allowed, replies, strict=True)}
             for question in unknown[len(allowed) :]:
                 none = Outcome(None, CallStatus.FALLBACK)
-                step = "action", question.key, CallStatus.FALLBACK, "", "a cap is reached", none
+                step = _Step("action", CallStatus.FALLBACK, "", "a cap is reached", none)
                 found[question.key] = _Said(CallStatus.FALLBACK, None, [step])
             return found
 
@@ -243,7 +308,7 @@ class LanguageDriver:
     def _allowed(self) -> int:
         """Questions that the caps allow now."""
         caps, spent = self.caps, self._spent
-        cost = (spent.prompt_tokens * caps.prompt_price + spent.answer_tokens * caps.answer_price) / 1e6
+        cost = caps.price(spent.prompt_tokens, spent.answer_tokens)
         over = caps.tokens is not None and spent.prompt_tokens + spent.answer_tokens >= caps.tokens
         if over or (caps.cost is not None and cost >= caps.cost):
             return 0
@@ -252,16 +317,16 @@ class LanguageDriver:
 
     async def _discuss(self, question: _Question, client: Any) -> _Said:
         """The graph, the action and at most one repair. Without a client the cache must know all replies."""
-        steps: list[Any] = []
+        steps: list[_Step] = []
         messages = list(question.messages)
         if self.graph:
             for node, asked in GRAPH.items():
                 await self._step(node, asked, messages, steps, client)
             messages.append(message("user", f"Now decide. {role(self.style)}"))
         form = {"schema": schema(question.offered)} if self.style.form == "json" else {}
-        key, outcome = await self._reply({"messages": messages, **self._settings(), **form}, client)
+        outcome = await self._reply({"messages": messages, **self._settings(), **form}, client)
         if outcome.reply is None:
-            steps.append(("action", key, outcome.status, "", outcome.error, outcome))
+            steps.append(_Step("action", outcome.status, "", outcome.error, outcome))
             return _Said(outcome.status, None, steps)
         status, action = parse(outcome.reply, question.offered)
         last = outcome
@@ -269,31 +334,31 @@ class LanguageDriver:
             offered = ", ".join(question.offered.values())
             wrong = f"That is not one of the offered actions. Offered: {offered}. Answer briefly."
             repair = [*messages, message("assistant", outcome.reply.text or "-"), message("user", wrong)]
-            _, last = await self._reply({"messages": repair, **self._settings(), **form}, client)
+            last = await self._reply({"messages": repair, **self._settings(), **form}, client)
             action = parse(last.reply, question.offered)[1] if last.reply is not None else None
             status = status if action is None else CallStatus.REPAIRED
             last = _both(outcome, last)
         text = last.reply.text if last.reply is not None else outcome.reply.text
-        steps.append(("action", key, status, text, last.error, last))
+        steps.append(_Step("action", status, text, last.error, last))
         return _Said(status, action, steps)
 
     async def _step(
-        self, node: str, asked: str, messages: list[dict[str, Any]], steps: list[Any], client: Any
+        self, node: str, asked: str, messages: list[dict[str, Any]], steps: list[_Step], client: Any
     ) -> None:
         messages.append(message("user", asked))
-        key, outcome = await self._reply({"messages": list(messages), **self._settings()}, client)
+        outcome = await self._reply({"messages": list(messages), **self._settings()}, client)
         if outcome.reply is None or not outcome.reply.text:  # the discussion goes on without it
             messages.pop()
-            steps.append((node, key, outcome.status, "", outcome.error, outcome))
+            steps.append(_Step(node, outcome.status, "", outcome.error, outcome))
             return
         messages.append(message("assistant", outcome.reply.text))
-        steps.append((node, key, outcome.status, outcome.reply.text, "", outcome))
+        steps.append(_Step(node, outcome.status, outcome.reply.text, "", outcome))
 
-    async def _reply(self, request: dict[str, Any], client: Any) -> tuple[str, Outcome]:
+    async def _reply(self, request: dict[str, Any], client: Any) -> Outcome:
         key = request_hash(request)
         known = self.cache.get(key)
         if known is not None:
-            return key, Outcome(known, CallStatus.OK)
+            return Outcome(known, CallStatus.OK)
         if client is None:
             raise _UnknownReply
         outcome = await self._chat.ask(client, request)
@@ -302,20 +367,19 @@ class LanguageDriver:
             self._spent.prompt_tokens += outcome.reply.prompt_tokens
             self._spent.answer_tokens += outcome.reply.answer_tokens
             self.cache.put(key, outcome.reply)
-        return key, outcome
+        return outcome
 
     # --- learning from failures
 
-    def reflect(self, told: Sequence[Facts], answers: Sequence[Answer], seed: int) -> list[Memory]:
+    def reflect(self, answers: Sequence[Answer], seed: int) -> list[Memory]:
         """Ask what was wrong in the last decisions before a failure.
 
         Args:
-          told: facts of the scenes, as numbers.
-          answers: what was answered, one for each scene.
+          answers: the decisions, with their facts.
           seed: of the world that failed, an even number.
 
         Returns:
-          Corrected examples; scenes for which no offered action is found have none.
+          Corrected examples; decisions for which no offered action is found have none.
 
         Raises:
           ValueError: the seed is for tests.
@@ -325,24 +389,30 @@ class LanguageDriver:
         async def all_of_them() -> list[Memory]:
             found = []
             async with self._chat.client() as client:
-                for facts_, answer in zip(told, answers, strict=True):
-                    text, offered = description(self.style, facts_), available(self.style, facts_)
-                    wrong = (
-                        f"This drive ended in a failure soon after. The answer was {answer.action}. "
-                        "Find the mistake, and give the action that would have been safe."
-                    )
-                    messages = [message("system", role(self.style)), message("user", f"{text}\n{wrong}")]
+                for answer in answers:
+                    told = facts_of(answer.facts)
+                    offered = available(self.style, told)
+                    messages = mistake(self.style, answer.scene, answer.action)
                     form = {"schema": schema(offered)} if self.style.form == "json" else {}
-                    request = {"messages": messages, **self._settings(), **form}
-                    _, outcome = await self._reply(request, client)
+                    outcome = await self._reply({"messages": messages, **self._settings(), **form}, client)
                     reply = outcome.reply
                     if reply is not None and parse(reply, offered)[1] is not None:
-                        numbers = tuple(map(float, features(facts_)))
-                        found.append(Memory(seed, numbers, text, reply.text))
+                        row = tuple(map(float, features(told)))
+                        found.append(Memory(seed, row, answer.scene, reply.text))
             return found
 
         with self._lock, ThreadPoolExecutor(1) as thread:
             return thread.submit(lambda: asyncio.run(all_of_them())).result()
+
+
+def mistake(style: Style, scene: str, action: str) -> list[dict[str, Any]]:
+    """Messages that ask for the mistake in a decision before a failure."""
+    label = style.labels.get(Meta[action], action)
+    wrong = (
+        f"This drive ended in a failure soon after. The answer was {label}. "
+        "Find the mistake, and give the action that would have been safe."
+    )
+    return [message("system", role(style)), message("user", f"{scene}\n{wrong}")]
 
 
 def _both(first: Outcome, second: Outcome) -> Outcome:
@@ -358,29 +428,13 @@ def _both(first: Outcome, second: Outcome) -> Outcome:
     )
 
 
-def _answer(
-    world: int, ego: int, time: float, node: str, prompt: str, status: CallStatus, text: str, error: str,
-    outcome: Outcome, *, action: Meta, first: bool,
-) -> Answer:  # fmt: skip
-    """A line of the log; calls count for the first of equal questions."""
-    asked = first and outcome.calls > 0
-    reply = outcome.reply
-    return Answer(
-        world, ego, time, node, prompt, status, action.name, text, error,
-        latency=round(outcome.latency, 4) if asked else 0.0,
-        calls=outcome.calls if asked else 0,
-        prompt_tokens=reply.prompt_tokens if asked and reply is not None else 0,
-        answer_tokens=reply.answer_tokens if asked and reply is not None else 0,
-    )  # fmt: skip
-
-
 def language(
     server: str | None = None,
     model: str | None = None,
     key_variable: str = "OPENAI_API_KEY",
     style: str = "plain",
     period: float | None = None,
-    latency: float = 0.0,
+    latency: float | None = None,
     graph: bool = False,
     memory: str | None = None,
     shots: int = 3,
@@ -394,7 +448,7 @@ def language(
     max_cost: float | None = None,
     prompt_price: float = 0.0,
     answer_price: float = 0.0,
-    images: Images | None = None,
+    cameras: Rig | str | None = None,
     check: bool = True,
 ) -> HostPolicy:
     """Egos driven by a language model behind a chat server.
@@ -405,7 +459,7 @@ def language(
       key_variable: environment variable with the key.
       style: protocol, see `STYLES`.
       period: s between questions; None: that of the style.
-      latency: s after which an answer counts; 0: the world waits.
+      latency: s after which an answer counts; None: the world waits for it.
       graph: whether scene, risk and plan are asked for before the action.
       memory: file of examples, see `write_memories`.
       shots: most examples in a question.
@@ -419,12 +473,13 @@ def language(
       max_cost: in the currency of the prices.
       prompt_price: of a million tokens.
       answer_price: of a million tokens.
-      images: PNG pictures of the cameras of an ego.
+      cameras: whose pictures are sent, a rig or "front", "three" or "six"; None: "three" with a style for
+        vision, otherwise no pictures.
       check: whether the server is asked now for its models.
 
     Raises:
-      ValueError: no server, a wrong key, an unknown model, images for a model of text, or another value that
-        makes no sense.
+      ValueError: no server, a wrong key, an unknown model, pictures for a model of text, or another value
+        that makes no sense.
     """
     load_httpx()
     url = server or os.environ.get("OPENAI_BASE_URL") or "https://api.openai.com/v1"
@@ -438,6 +493,9 @@ def language(
         memories = read_memories(memory) if memory else ()
     except OSError as error:
         raise ValueError(f"memory: {memory}: {error.strerror}") from None
+    if cameras is None and protocol.images:
+        cameras = "three"
+    rig = None if cameras is None else rig_of(cameras)
     driver = LanguageDriver(
         Server(url, name, key_variable, retries, concurrency),
         style=protocol,
@@ -446,11 +504,30 @@ def language(
         graph=graph,
         memories=memories,
         shots=shots,
-        images=images,
+        cameras=() if rig is None else rig.names,
         caps=Caps(max_calls, max_tokens, max_cost, prompt_price, answer_price),
         cache=Cache(Path(cache) if cache else None),
         log=Log(Path(log) if log else None),
     )
-    if check:
-        driver.chat.check(images=protocol.images)
-    return HostPolicy(driver, command="meta", memory=_MEMORY, observe=LookAround(), name="language")
+    look = LookAround(rig=rig)
+    if check and not _OFFLINE.get():
+        driver.chat.check(images=cameras is not None)
+    return HostPolicy(driver, command="meta", memory=_MEMORY, observe=look, keyed=True, name="language")
+
+
+_OFFLINE: ContextVar[bool] = ContextVar("offline", default=False)
+
+
+@contextmanager
+def offline() -> Iterator[None]:
+    """Within it `language` asks no server: for worlds whose answers are known."""
+    token = _OFFLINE.set(True)
+    try:
+        yield
+    finally:
+        _OFFLINE.reset(token)
+
+
+def language_drivers(policy: Any) -> list[LanguageDriver]:
+    """The drivers within a policy that ask a model."""
+    return [x.function for x in planners(policy) if isinstance(x.function, LanguageDriver)]

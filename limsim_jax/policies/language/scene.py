@@ -5,6 +5,7 @@ Functions take NumPy or JAX arrays, so that a planner in JAX and a text are made
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -14,6 +15,8 @@ import numpy as np
 
 from limsim_jax.maps.lane_map import LaneMap, width
 from limsim_jax.policies.host import Observation, Observe
+from limsim_jax.policies.language.pictures import look
+from limsim_jax.sensors.rig import Rig
 from limsim_jax.traffic.ego import Meta, meta_lane
 from limsim_jax.types import Config, State
 
@@ -32,6 +35,7 @@ class Scene(NamedTuple):
     left: Any  # bool: marks and lanes allow a change to the left now
     right: Any
     lane_width: Any  # m
+    pictures: Any = None  # [B, E, C, H, W, 3], of the cameras; None: there are none
 
 
 @dataclass(frozen=True)
@@ -42,11 +46,18 @@ class LookAround:
       nearest: number of vehicles.
       points: points of the reference path.
       step: m between points.
+      rig: whose cameras take pictures; None: none are taken.
     """
 
     nearest: int = 12
     points: int = 60
     step: float = 2.5
+    rig: Rig | None = None
+
+    @property
+    def needs_scenery(self) -> bool:
+        """Whether pictures are taken."""
+        return self.rig is not None
 
     def __call__(self, config: Config, lane_map: LaneMap, state: State) -> Scene:
         """The world as its egos see it."""
@@ -57,7 +68,8 @@ class LookAround:
             return meta_lane(lane_map, state, jnp.full_like(slot, int(action))) != 0
 
         lane_width = width(lane_map, state.lane[slot], state.s[slot])
-        return Scene(seen, may(Meta.LEFT), may(Meta.RIGHT), lane_width)
+        pictures = None if self.rig is None else look(self.rig, lane_map, state)
+        return Scene(seen, may(Meta.LEFT), may(Meta.RIGHT), lane_width, pictures)
 
 
 class Neighbour(NamedTuple):
@@ -83,6 +95,26 @@ class Facts(NamedTuple):
     to_go_within: Any  # m
     left: Any  # bool
     right: Any
+
+
+_AROUND = ("ahead", "left_ahead", "left_behind", "right_ahead", "right_behind")
+
+
+def numbers(told: Facts) -> tuple[float, ...]:
+    """The facts of one ego as a row of numbers, `[18]`."""
+    flat = (x if isinstance(x, tuple) else (x,) for x in told)
+    return tuple(float(number) for part in flat for number in part)
+
+
+def facts_of(row: Sequence[float]) -> Facts:
+    """The facts that `numbers` made a row of."""
+    left = iter(row)
+    values: dict[str, Any] = {
+        name: Neighbour(next(left), next(left)) if name in _AROUND else next(left) for name in Facts._fields
+    }
+    values |= {name: int(values[name]) for name in ("light", "to_go")}
+    values |= {name: bool(values[name]) for name in ("left", "right")}
+    return Facts(**values)
 
 
 def facts(scene: Scene, xp: ModuleType = np) -> Facts:

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from limsim_jax.policies.language.answers import CallStatus, Reply
+from limsim_jax.policies.language.answers import SILENT, CallStatus, Reply
 
 
 def request_hash(request: Mapping[str, Any]) -> str:
@@ -61,19 +61,22 @@ class Answer:
     """One question and how it ended.
 
     Attributes:
-      world: row in the batch of the call.
-      ego: row of the ego.
+      world: its seed in results, otherwise its row in the batch of the call.
+      ego: number of the ego.
       time: s since the start of the episode.
       node: of the graph of questions.
-      prompt: hash of the request.
+      prompt: hash of what was asked about the scene.
       status: how the question ended.
       action: name of the action that was taken.
       text: of the reply.
       error: what went wrong, in one line.
-      latency: s of wall clock that the calls took; 0 from the cache.
-      calls: HTTP requests, retries and repairs included; 0 from the cache.
+      latency: s of wall clock that the calls took; 0 where the reply was known.
+      calls: HTTP requests, retries and repairs included; 0 where the reply was known.
       prompt_tokens: of all calls.
       answer_tokens: of all calls.
+      cost: of all calls, in the currency of the prices.
+      scene: text that the model read, at the node of the action.
+      facts: of which that text tells, see `scene.numbers`.
     """
 
     world: int
@@ -89,6 +92,24 @@ class Answer:
     calls: int = 0
     prompt_tokens: int = 0
     answer_tokens: int = 0
+    cost: float = 0.0
+    scene: str = ""
+    facts: tuple[float, ...] = ()
+
+    @property
+    def cached(self) -> bool:
+        """Whether there is a reply, and no call was made for it."""
+        return not self.calls and self.status not in SILENT
+
+    @property
+    def decides(self) -> bool:
+        """Whether the action follows from it; others of a graph come before."""
+        return self.node == "action"
+
+
+def lines_of(answers: Iterable[Answer]) -> str:
+    """JSON Lines."""
+    return "".join(json.dumps(asdict(x), ensure_ascii=False) + "\n" for x in answers)
 
 
 class Log:
@@ -111,9 +132,8 @@ class Log:
         answers = list(answers)
         self.answers += answers
         if self._path is not None:
-            lines = "".join(json.dumps(asdict(x), ensure_ascii=False) + "\n" for x in answers)
             with open(self._path, "a", encoding="utf-8") as file:
-                file.write(lines)
+                file.write(lines_of(answers))
 
 
 def read_answers(path: str | Path) -> list[Answer]:
@@ -127,31 +147,34 @@ def read_answers(path: str | Path) -> list[Answer]:
     for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), 1):
         try:
             row = json.loads(line)
-            found.append(Answer(**row | {"status": CallStatus(row["status"])}))
+            status, told = CallStatus(row["status"]), tuple(map(float, row.get("facts", ())))
+            found.append(Answer(**row | {"status": status, "facts": told}))
         except (KeyError, TypeError, ValueError):
             raise ValueError(f"{path}: line {number} is no answer of a language driver") from None
     return found
 
 
 def shares(answers: Iterable[Answer]) -> dict[str, float]:
-    """Shares of each status; calls, tokens and latency of questions.
+    """Shares of each status among decisions; what they took per decision.
 
-    Calls and tokens are per question, latency is the mean in s of those that the server was asked.
-
-    Steps of a graph before the action count as calls only.
+    Beside them: `questions`, their number; `cached`, the share for which no call was made; `calls`,
+    `prompt_tokens`, `answer_tokens` and `cost` per decision, those of earlier steps of a graph included; and
+    `latency`, the mean time (s) of steps for which the server was asked, 0 if there are none.
     """
     answers = list(answers)
-    decided = [x for x in answers if x.node == "action"]
+    decided = [x for x in answers if x.decides]
     counts, total = Counter(x.status for x in decided), max(len(decided), 1)
     found: dict[str, float] = {status.value: counts[status] / total for status in CallStatus}
     asked = [x for x in answers if x.calls]
-    return found | {
-        "questions": float(len(decided)),
-        "calls": sum(x.calls for x in answers) / total,
-        "prompt_tokens": sum(x.prompt_tokens for x in answers) / total,
-        "answer_tokens": sum(x.answer_tokens for x in answers) / total,
-        "latency": sum(x.latency for x in asked) / max(len(asked), 1),
-    }
+    called = {(x.world, x.ego, x.time) for x in asked}
+    known = sum(x.cached and (x.world, x.ego, x.time) not in called for x in decided)
+    spent = ("calls", "prompt_tokens", "answer_tokens", "cost")
+    return (
+        found
+        | {"questions": float(len(decided)), "cached": known / total}
+        | {name: sum(getattr(x, name) for x in answers) / total for name in spent}
+        | {"latency": sum(x.latency for x in asked) / max(len(asked), 1)}
+    )
 
 
 def answer_table(answers: Iterable[Answer]) -> str:

@@ -94,7 +94,8 @@ def write_report(
       results: of a sweep.
       path: the .html file to write; its folder is made.
       replayer: regenerates episodes: (scenario, policy, seeds) -> a (network, lane_map, trace, slot of the
-        ego, moments) of each. Without one there are neither pictures nor replays, only commands for them.
+        ego, moments) of each, with metrics and answers of a model behind them where there are any. Without
+        one there are neither pictures nor replays, only commands for them.
       worst: how many of the worst episodes to show with pictures.
       seconds: s, after which no further scenario or policy is replayed; the first one always is.
       say: called with a line before the replays of each.
@@ -198,12 +199,15 @@ def _shown(
     from limsim_jax.report.pictures import pictures
     from limsim_jax.report.viewer import write_viewer
 
-    network, lane_map, trace, ego, moments, *_ = replay
+    network, lane_map, trace, ego, moments, *more = replay
+    answers = more[1] if len(more) > 1 else ()
     name = f"{file_name(row['scenario'])}-{file_name(row['policy'])}-{int(row['seed'])}.html"
     folder = path.parent / "replays"
     folder.mkdir(parents=True, exist_ok=True)
     title = f"{names.label((row['scenario'], row['policy']))}, seed {row['seed']}"
-    write_viewer(folder / name, network, lane_map, trace, ego=ego, moments=moments, title=title)
+    write_viewer(
+        folder / name, network, lane_map, trace, ego=ego, moments=moments, title=title, answers=answers
+    )
     views = [
         {
             "alt": f"{title}, {caption}",

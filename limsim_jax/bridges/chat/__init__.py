@@ -1,0 +1,1 @@
+"""A chat server in the dialect of OpenAI, with our own models."""
