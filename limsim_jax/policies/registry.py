@@ -7,6 +7,7 @@ from typing import Any
 
 from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic, PolicyLike, build_policy
+from limsim_jax.policies.delayed import Delayed
 from limsim_jax.policies.end_to_end import EndToEnd
 from limsim_jax.policies.language.driver import language
 from limsim_jax.policies.language.rules import RuleTable
@@ -39,6 +40,17 @@ def area_of_interest(
     )
 
 
+def late(
+    of: str | PolicyLike = "pdm_closed", delay: float = 0.5, options: Mapping[str, Any] | None = None
+) -> Delayed:
+    """`Delayed` with a planner by name; `options` are those of the planner.
+
+    Raises:
+      ValueError: an unknown name or option, or a value that makes no sense.
+    """
+    return Delayed(_by_name(of, options or {}), delay)
+
+
 def _by_name(policy: str | PolicyLike, options: Mapping[str, Any]) -> PolicyLike:
     if not isinstance(policy, str):
         return policy
@@ -68,6 +80,7 @@ POLICIES: dict[str, Callable[..., PolicyLike]] = {
     "limsim_tm_privileged": _preset(LimSimTM, privileged=True, name="limsim_tm_privileged"),
     "area_of_interest": area_of_interest,
     "end_to_end": EndToEnd,
+    "delayed": late,
     "rule_table": RuleTable,
     "language": language,
 }
