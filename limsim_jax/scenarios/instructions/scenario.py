@@ -177,7 +177,7 @@ def scenario(
 
 
 def severity(made: Scenario, seeds: int = SEEDS) -> list[tuple[float, Scenario]]:
-    """The same scenario with all distances to the ego scaled by `FACTORS`, each tried.
+    """The same scenario with distances to the ego scaled by `FACTORS`.
 
     It finds out from where on the reference driver has contacts; it gives no probability.
 
@@ -224,7 +224,7 @@ def try_out(file: ExperimentFile, intent: Intent, placed: Placed, seeds: int) ->
 
 
 def _as_others(file: ExperimentFile) -> ExperimentFile:
-    """The same experiment with a script of everything, so that all scenarios share programs."""
+    """The same experiment; all scenarios share programs with it."""
     table = file.model_dump()
     if not file.zone:
         table["zone"] = [{"friction": 2.0}]  # more than any driver asks for
