@@ -135,16 +135,20 @@ class Watched(SumoProcess):
         return self.kept[-1]
 
 
-@pytest.fixture(scope="module")
-def world(config: Path) -> Any:
+def unbraked(config: Path) -> SumoWorld:
     """Egos that never brake: they run into queues."""
-    patch = pytest.MonkeyPatch()
-    patch.setattr(episodes_module, "SumoProcess", Watched)
-    patch.setattr(episodes_module, "run_often", run_once)  # it compiles in a fraction of the time
-    yield SumoWorld(
+    return SumoWorld(
         config, policy=lj.ConstantSpeed(), takeover=(30, 60), horizon=30.0, slots=40, chunk=2,
         success={"sumo_collisions": 0.0},
     )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def world(config: Path) -> Any:
+    patch = pytest.MonkeyPatch()
+    patch.setattr(episodes_module, "SumoProcess", Watched)
+    patch.setattr(episodes_module, "run_often", run_once)  # it compiles in a fraction of the time
+    yield unbraked(config)
     patch.undo()
 
 
@@ -175,6 +179,16 @@ def test_equal_seeds_are_equal_worlds_with_metrics_of_both_sides(world: SumoWorl
     for k in np.flatnonzero(hit):
         assert metrics["sumo_collisions"][k] > 0 and metrics["success"][k] == 0
         assert metrics["contact_time"][k] == pytest.approx(metrics["sumo_collision_time"][k], abs=0.11)
+
+
+@pytest.mark.engine
+def test_a_world_does_not_depend_on_the_others_of_its_call(
+    world: SumoWorld, outcome: Outcome, config: Path
+) -> None:
+    """Columns of routes are shared among worlds; their numbers are no part of a digest."""
+    other: Any = unbraked(config).episodes
+    other._compiled = world.episodes._compiled
+    assert other.run([3]).digest[0] == outcome.digest[1]
 
 
 @pytest.mark.engine

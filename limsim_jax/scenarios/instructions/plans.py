@@ -39,7 +39,7 @@ OVERTAKES = 25.0
 """m behind the ego at which a vehicle starts that overtakes."""
 
 BESIDE = 2.0
-"""m, least distance along the road of a vehicle that starts in the lane beside and falls back or passes."""
+"""m ahead of the ego before which no vehicle that overtakes changes lanes."""
 
 EGO = 5.0
 """m, length of the ego."""
@@ -166,14 +166,16 @@ def _cut_in(case: _Case) -> Plan:
     faster = case.v - case.ego
     move: dict[str, Any] = {"change_lane": _TURNS[-side], "duration": CHANGE}
     if "overtake" in case.kinds:
-        front = case.behind(OVERTAKES)
-        move["at"] = round((near + case.length - front) / max(faster, 1.0), 2)
+        front, passes = case.behind(OVERTAKES), max(faster, 1.0)
+        middle_at = (near + case.length - front) / passes
+        past = (BESIDE + case.length - front) / passes
+        move["at"] = round(max(middle_at - CHANGE / 2, past), 2)
     elif faster < -0.5:
         front = max(near - faster * case.time if case.gap is None else case.gap, near + 1) + case.length
         move["within"] = round(near + (case.length + EGO) / 2, 2)
     else:
         front = (near - faster * case.time if case.gap is None else case.gap) + case.length
-        move["at"] = round(case.time, 2)
+        move["at"] = round(max(case.time - CHANGE / 2, 0.0), 2)
     hold = case.holds | {"careful": faster <= 0.5}
     return case.plan(front, side, moves=-side, actions=[hold, move])
 
