@@ -4,8 +4,8 @@
     python experiments/sumo_bridge.py --full
     python experiments/sumo_bridge.py --only-cost
 
-`--full`: both planners, 120 s, the networks and numbers of seeds of `FULL`. `--out DIR` keeps the worlds, and
-the same command goes on where it was stopped. The costs of the bridge are measured once, or by `--only-cost`.
+`--full`: both planners, 120 s, 50 seeds, the networks of `FULL`. `--out DIR` keeps the worlds, and the same
+command goes on where it was stopped. The costs of the bridge are measured once, or by `--only-cost`.
 
 A seed draws a car of the scenario's own demand; the planner takes it over within its first minutes. For both
 drivers it is the same car, at the same moment, among the same vehicles: SUMO drives them on, or we take all
@@ -40,13 +40,7 @@ from limsim_jax.xla import run_often
 
 RESULTS = Path(__file__).parent / "results"
 DATA = Path(os.environ.get("LIMSIM_SHARED_DATA", "shared/data")) / "sumo"
-FULL = {
-    "ingolstadt1": 50,
-    "limsim_roundabout": 50,
-    "limsim_bigInter": 50,
-    "bologna_pasubio": 10,
-    "limsim_town05": 10,
-}
+FULL = ("ingolstadt1", "limsim_roundabout", "limsim_bigInter")
 COLUMNS = ("success", "nuplan_score", "at_fault_contacts", "completion", "mean_speed", "sumo_collisions")
 CHUNK = 10  # worlds at the same time
 KEPT = 24  # decisions that are timed
@@ -114,10 +108,10 @@ def decision_ms(world: lj.SumoWorld) -> float:
 
 
 def rows(
-    nets: dict[str, int], policies: list[str], horizon: float, folder: Path
+    nets: list[str], policies: list[str], seeds: int, horizon: float, folder: Path
 ) -> Iterator[list[dict[str, Any]]]:
     """A row for each kind of drivers, per network and planner."""
-    for net, seeds in nets.items():
+    for net in nets:
         for name in policies:
             compiled, seen = None, []
             for drivers in ("sumo", "ours"):
@@ -227,18 +221,17 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder that keeps the worlds")
     parser.add_argument("--only-cost", action="store_true")
     given = parser.parse_args()
-    nets: dict[str, int] = dict.fromkeys(given.nets.split(","), int(given.seeds))
-    policies = given.policies.split(",")
-    horizon = given.horizon
+    nets, policies = given.nets.split(","), given.policies.split(",")
+    seeds, horizon = given.seeds, given.horizon
     if given.full:
-        nets, policies, horizon = FULL, ["pdm_closed", "limsim_tm"], 120.0
+        nets, policies, seeds, horizon = list(FULL), ["pdm_closed", "limsim_tm"], 50, 120.0
     path = RESULTS / "sumo_bridge.json"
     found = json.loads(path.read_text()) if path.exists() else {"rows": [], "horizon": horizon, "cost": []}
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) if given.out is None else given.out
         if not given.only_cost:
             found |= {"rows": [], "horizon": horizon}
-            for more in rows(nets, policies, horizon, out):
+            for more in rows(nets, policies, seeds, horizon, out):
                 found["rows"] += more
                 save(path, found)
         if given.only_cost or not found["cost"]:
