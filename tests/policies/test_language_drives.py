@@ -33,9 +33,9 @@ PRICES = {"prompt_price": 2.0, "answer_price": 4.0}
 
 
 def episodes(policy=None, options=None):
-    """Worlds in which the ego starts above the limit, under a policy or under `language` as a file has it."""
+    """Worlds in which the ego starts below the limit, under a policy or under `language` as a file has it."""
     told = {} if options is None else {"policy": "language", "options": options}
-    ego = EgoTable(start="1-", lane=2, s=60.0, v=36.0, goal="2-", **told)
+    ego = EgoTable(start="1-", lane=2, s=60.0, v=26.0, goal="2-", **told)
     experiment = ExperimentFile(
         name="small", map="highway", horizon=20.0, slots=64, ego=(ego,), traffic=TrafficTable(vehicles=50)
     )
