@@ -82,9 +82,7 @@ def test_a_model_that_reads_drives_like_the_rules_in_jax(drive):
     assert {x.status for x in answers} == {CallStatus.OK}
     chosen = Counter(x.action for x in answers)
     print(chosen)
-    assert (
-        min(chosen["ACCELERATE"] + chosen["KEEP"], chosen["LEFT"] + chosen["DECELERATE"] + chosen["STOP"]) > 0
-    ), chosen
+    assert min(chosen["ACCELERATE"], chosen["KEEP"]) > 0, chosen
     distance = by_rules.metrics["distance"], model.metrics["distance"]
     print("distance", *distance, chosen)
     np.testing.assert_allclose(distance[1].mean(), distance[0].mean(), rtol=0.01)
