@@ -22,7 +22,7 @@ import os
 import pickle
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -108,7 +108,7 @@ def decision_ms(world: lj.SumoWorld) -> float:
 
 
 def rows(
-    nets: list[str], policies: list[str], seeds: int, horizon: float, folder: Path
+    nets: Sequence[str], policies: list[str], seeds: int, horizon: float, folder: Path
 ) -> Iterator[list[dict[str, Any]]]:
     """A row for each kind of drivers, per network and planner."""
     for net in nets:
@@ -224,7 +224,7 @@ def main() -> None:
     nets, policies = given.nets.split(","), given.policies.split(",")
     seeds, horizon = given.seeds, given.horizon
     if given.full:
-        nets, policies, seeds, horizon = list(FULL), ["pdm_closed", "limsim_tm"], 50, 120.0
+        nets, policies, seeds, horizon = FULL, ["pdm_closed", "limsim_tm"], 50, 120.0
     path = RESULTS / "sumo_bridge.json"
     found = json.loads(path.read_text()) if path.exists() else {"rows": [], "horizon": horizon, "cost": []}
     with tempfile.TemporaryDirectory() as folder:

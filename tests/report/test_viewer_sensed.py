@@ -24,7 +24,7 @@ def world():
 
 @pytest.fixture(scope="module")
 def film(world):
-    return film_of(TIME[FRAMES], world[2].box[FRAMES, SELF, :3] + np.float32((0, 0, 0.6)))
+    return film_of(TIME[FRAMES], world[2].box[FRAMES, SELF, :3] + np.array((0, 0, 0.6), np.float32))
 
 
 @pytest.fixture(scope="module")

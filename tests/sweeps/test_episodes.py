@@ -53,7 +53,7 @@ def cases():
 
 @pytest.mark.parametrize("policy, seed", cases())
 def test_the_ego_as_its_trace_has_it(policy, seed):
-    _, lane_map, trace, ego, _, metrics = replayed(policy, seed)
+    _, lane_map, trace, ego, _, metrics, _ = replayed(policy, seed)
     on = trace.active[:, ego]
     v, lane, s = trace.v[on, ego], trace.lane[on, ego], trace.s[on, ego]
     assert metrics["duration"] == pytest.approx(trace.time[on][-1], abs=0.11)
@@ -75,7 +75,7 @@ def test_the_ego_as_its_trace_has_it(policy, seed):
 
 @pytest.mark.parametrize("policy, seed", cases())
 def test_contacts_are_where_bodies_overlap(policy, seed):
-    _, _, trace, ego, _, metrics = replayed(policy, seed)
+    _, _, trace, ego, _, metrics, _ = replayed(policy, seed)
     still = jnp.zeros(2)
     first, who = None, None
     for t in range(len(trace.time)):
@@ -131,7 +131,7 @@ def test_a_brief_replay_is_the_beginning_of_the_whole_one(monkeypatch):
 
 @pytest.mark.parametrize("policy, seed", cases())
 def test_lights_crossed_on_red(policy, seed):
-    _, lane_map, trace, ego, _, metrics = replayed(policy, seed)
+    _, lane_map, trace, ego, _, metrics, _ = replayed(policy, seed)
     crossed = 0
     for t in range(1, len(trace.time)):
         if not trace.active[t, ego] or trace.lane[t, ego] == trace.lane[t - 1, ego]:
@@ -149,7 +149,7 @@ def test_lights_crossed_on_red(policy, seed):
 @pytest.mark.parametrize("policy, seed", cases())
 def test_headway_to_the_leader_on_the_lane(policy, seed):
     """At least as short as to the nearest on the same lane, found by a loop."""
-    _, _, trace, ego, _, metrics = replayed(policy, seed)
+    _, _, trace, ego, _, metrics, _ = replayed(policy, seed)
     least = np.inf
     until = metrics["contact_time"] - 0.5 if metrics["contacts"] else np.inf
     for t in range(5, len(trace.time)):
@@ -167,7 +167,7 @@ def test_headway_to_the_leader_on_the_lane(policy, seed):
 
 @pytest.mark.parametrize("policy, seed", cases())
 def test_traffic_as_the_trace_has_it(policy, seed):
-    _, _, trace, _, _, metrics = replayed(policy, seed)
+    _, _, trace, _, _, metrics, _ = replayed(policy, seed)
     time = trace.active.sum() * 0.1
     distance = (trace.v * trace.active).sum() * 0.1
     assert metrics["traffic_mean_speed"] == pytest.approx(distance / time, rel=0.01)

@@ -204,7 +204,9 @@ class ScenarioEpisodes(Episodes):
             units[f"parameter_{name}"] = f"parameter of the scenario{said}"
         return units
 
-    def _columns(self, result: Result) -> dict[str, NDArray[np.float64]]:
+    def _columns(
+        self, result: Result, seeds: Sequence[int], answers: Mapping[int, Sequence[Any]]
+    ) -> dict[str, NDArray[np.float64]]:
         from limsim_jax.metrics.reductions import on_host
 
         found: dict[str, NDArray[np.float64]] = dict(on_host(result.measures))
@@ -220,7 +222,7 @@ class ScenarioEpisodes(Episodes):
     def run(self, seeds: Sequence[int]) -> Outcome:
         """Run at most `chunk` worlds."""
         (_, result), *_ = self.worlds.chunks(seeds)
-        metrics = self._columns(result)
+        metrics = self._columns(result, seeds, {})
         metrics |= self._parameter_columns(seeds)
         metrics = {name: metrics[name] for name in self.units}
         rows, egos = np.asarray(seeds, np.int64), np.zeros(len(seeds), np.int32)
