@@ -11,6 +11,24 @@ from limsim_jax.sweeps.runner import Progress
 
 
 @contextlib.contextmanager
+def _bar(figures: str) -> Iterator[tuple[Any, bool]]:
+    """A bar with these figures behind it, and whether it is shown: in a terminal or a notebook."""
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    console = Console()
+    live = console.is_terminal or console.is_jupyter
+    with rich_progress.Progress(
+        rich_progress.TextColumn("{task.description:<28}"),
+        rich_progress.BarColumn(bar_width=24),
+        rich_progress.TextColumn(figures),
+        console=console,
+        disable=not live,
+    ) as bar:
+        yield bar, live
+
+
+@contextlib.contextmanager
 def progress_bar(shown: bool = True) -> Iterator[Callable[[Progress], None] | None]:
     """What `runner.sweep` tells its progress to.
 
@@ -20,18 +38,7 @@ def progress_bar(shown: bool = True) -> Iterator[Callable[[Progress], None] | No
     if not shown:
         yield None
         return
-    from rich import progress as rich_progress
-    from rich.console import Console
-
-    console = Console()
-    live = console.is_terminal or console.is_jupyter
-    with rich_progress.Progress(
-        rich_progress.TextColumn("{task.description:<28}"),
-        rich_progress.BarColumn(bar_width=24),
-        rich_progress.TextColumn("{task.completed:.0f}/{task.total:.0f} worlds  {task.fields[said]}"),
-        console=console,
-        disable=not live,
-    ) as bar:
+    with _bar("{task.completed:.0f}/{task.total:.0f} worlds  {task.fields[said]}") as (bar, live):
         tasks: dict[tuple[str, str], Any] = {}
         stages: dict[tuple[str, str], str] = {}
 
@@ -63,18 +70,7 @@ def count_bar(shown: bool, name: str) -> Iterator[Callable[[int, int], None] | N
     if not shown:
         yield None
         return
-    from rich import progress as rich_progress
-    from rich.console import Console
-
-    console = Console()
-    live = console.is_terminal or console.is_jupyter
-    with rich_progress.Progress(
-        rich_progress.TextColumn("{task.description:<28}"),
-        rich_progress.BarColumn(bar_width=24),
-        rich_progress.TextColumn("{task.completed:.0f} of at most {task.total:.0f} worlds"),
-        console=console,
-        disable=not live,
-    ) as bar:
+    with _bar("{task.completed:.0f} of at most {task.total:.0f} worlds") as (bar, live):
         task, told = bar.add_task(name, total=1), -1
 
         def show(done: int, most: int) -> None:
