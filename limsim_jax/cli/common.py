@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,15 +19,15 @@ JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help=
 NoCacheOption = Annotated[bool, typer.Option("--no-cache", help="Read the map file itself; leave no trace.")]
 
 
-def table(lines: list[tuple[str, str]], title: str | None = None) -> None:
-    """Print names and values in two columns."""
+def table(lines: Sequence[Sequence[str]], title: str | None = None, head: Sequence[str] = ()) -> None:
+    """Print rows of cells, such as names and values."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(show_header=False, box=None, pad_edge=False)
-    for name, value in lines:
-        table.add_row(Text(name), Text(value))
+    table = Table(*head, show_header=bool(head), box=None, pad_edge=False)
+    for cells in lines:
+        table.add_row(*(Text(cell) for cell in cells))
     console = Console()
     if title is not None:
         console.print(Text(title, style="bold"))

@@ -35,18 +35,13 @@ def estimate(
     from limsim_jax.api.estimate import estimate as run
     from limsim_jax.api.experiment import Experiment
     from limsim_jax.files import check_writable
-    from limsim_jax.sweeps.estimate import LEAST
 
-    if len(experiments) != 1:
-        names = ", ".join(one.name for one in experiments)
-        raise typer.BadParameter(f"one experiment at a time, not {names}", param_hint="--estimate")
+    experiment = Experiment(_one(experiments, "--estimate"))
     check_writable(json_file)
     begin = time.perf_counter()
-    found = run(
-        Experiment(experiments[0]), event, method=method or "subset",
-        worlds=5000 if budget is None else budget, least=LEAST if least is None else least,
-        out=folder, chunk=chunk, fresh=fresh,
-    )  # fmt: skip
+    told = {"method": method, "worlds": budget, "least": least}
+    options: dict[str, Any] = {name: value for name, value in told.items() if value is not None}
+    found = run(experiment, event, out=folder, chunk=chunk, fresh=fresh, **options)
     table(found.rows(), f"{found.scenario}, {found.policy}: {found.event.name}")
     if json_file is not None:
         write_json(json_file, found.as_json())
@@ -92,7 +87,7 @@ def triage(
     if not found:
         print("no episode failed")
     else:
-        columns(HEAD, rows_of(found))
+        table(rows_of(found), head=HEAD)
     if json_file is not None:
         write_json(json_file, [
             {
@@ -131,15 +126,12 @@ def sensitivity(
     from limsim_jax.files import check_writable
     from limsim_jax.sweeps.experiment import read_experiments
 
-    experiments = read_experiments(experiment, policy=policy)
-    if len(experiments) != 1:
-        names = ", ".join(one.name for one in experiments)
-        raise typer.BadParameter(f"one experiment at a time, not {names}", param_hint="EXPERIMENT")
-    page = Path("results") / f"{experiments[0].name}-sensitivity.html" if out is None else out
+    one = _one(read_experiments(experiment, policy=policy), "EXPERIMENT")
+    page = Path("results") / f"{one.name}-sensitivity.html" if out is None else out
     page.parent.mkdir(parents=True, exist_ok=True)
     check_writable(json_file, page)
     wanted = None if metrics is None else [name.strip() for name in metrics.split(",")]
-    found = run(Experiment(experiments[0]), metrics=wanted, seeds=seeds, chunk=chunk, page=page)
+    found = run(Experiment(one), metrics=wanted, seeds=seeds, chunk=chunk, page=page)
     print(found)
     if json_file is not None:
         write_json(json_file, found.as_json())
@@ -147,16 +139,12 @@ def sensitivity(
     print(f"wrote {page}")
 
 
-def columns(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    shown = Table(*head, box=None, pad_edge=False)
-    for row in rows:
-        shown.add_row(*(Text(cell) for cell in row))
-    Console().print(shown)
+def _one(experiments: Sequence[ExperimentFile], hint: str) -> ExperimentFile:
+    """The only experiment; `hint` is the parameter that several do not go with."""
+    if len(experiments) != 1:
+        names = ", ".join(one.name for one in experiments)
+        raise typer.BadParameter(f"one experiment at a time, not {names}", param_hint=hint)
+    return experiments[0]
 
 
 def add_commands(app: typer.Typer) -> None:

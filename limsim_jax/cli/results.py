@@ -167,6 +167,23 @@ def sweep(
     from limsim_jax.sweeps.experiment import read_experiments
 
     part, stop = _shard(shard), _until(until_ci)
+    if event is None:
+        _refuse(
+            {"--method": method, "--budget": budget, "--least": least, "--json": json_file},
+            "only with --estimate",
+        )
+    elif is_scenario(experiment):
+        raise typer.BadParameter("a .xosc has variants, no random numbers", param_hint="--estimate")
+    else:
+        alone = {
+            "--shard": shard, "--until-ci": until_ci, "--workers": workers, "--seeds": seeds,
+            "--odd-seeds": odd, "--engine sumo": None if engine == "limsim" else engine,
+        }  # fmt: skip
+        for name, value in alone.items():
+            if value is not None:
+                raise typer.BadParameter(
+                    f"an estimate is one run of its own, without {name}", param_hint="--estimate"
+                )
     if is_scenario(experiment):
         if engine != "limsim" or workers is not None or stop is not None:
             raise typer.BadParameter("not with --engine, --workers or --until-ci", param_hint="EXPERIMENT")
@@ -192,30 +209,17 @@ def sweep(
         raise typer.BadParameter(f"{workers}; at least 1", param_hint="--workers")
     if fresh and part is not None:
         raise typer.BadParameter("it would remove the results of other shards", param_hint="--fresh")
-    in_estimates = {"--method": method, "--budget": budget, "--least": least, "--json": json_file}
-    for name, value in in_estimates.items():
-        if value is not None and event is None:
-            raise typer.BadParameter("only with --estimate", param_hint=name)
     in_sumo = {"--ego": ego, "--egos": egos, "--horizon": horizon, "--drivers": drivers}
     if ego is not None and egos is not None:
         raise typer.BadParameter("--ego names them; --egos draws so many", param_hint="--egos")
     if engine == "sumo":
-        _not_with_sumo({"--map": map_file, "--workers": workers})
+        _refuse({"--map": map_file, "--workers": workers}, "not with --engine sumo")
         experiments: list[ExperimentFile] = []
     else:
-        for name, value in in_sumo.items():
-            if value is not None:
-                raise typer.BadParameter("only with --engine sumo", param_hint=name)
+        _refuse(in_sumo, "only with --engine sumo")
         experiments = read_experiments(experiment, map_file=map_file, policy=policy)
     folder = Path("results") / Path(experiment).stem if out is None else out
     if event is not None:
-        alone = {"--shard": shard, "--until-ci": until_ci, "--workers": workers}
-        alone["--engine sumo"] = None if engine == "limsim" else engine
-        for name, value in alone.items():
-            if value is not None:
-                raise typer.BadParameter(
-                    f"an estimate is one run of its own, without {name}", param_hint="--estimate"
-                )
         from limsim_jax.cli.rare import estimate
 
         folder = folder.with_name(f"{folder.name}-estimate") if out is None else out
@@ -562,10 +566,11 @@ def build(
     return [Episodes(one, chunk=chunk) for one in experiments]
 
 
-def _not_with_sumo(options: dict[str, Any]) -> None:
+def _refuse(options: Mapping[str, Any], message: str) -> None:
+    """Refuse options that are given; None: not given."""
     for name, value in options.items():
         if value is not None:
-            raise typer.BadParameter("not with --engine sumo", param_hint=name)
+            raise typer.BadParameter(message, param_hint=name)
 
 
 def _sumo_episodes(

@@ -12,6 +12,7 @@ FAULTS = [
     (("--estimate", "contact", "--shard", "0/2"), "an estimate is one run of its own, without --shard"),
     (("--estimate", "contact", "--until-ci", "0.1"), "without --until-ci"),
     (("--estimate", "contact", "--workers", "2"), "without --workers"),
+    (("--estimate", "contact", "--seeds", "5"), "without --seeds"),
 ]
 
 
@@ -21,6 +22,20 @@ def test_options_that_do_not_go_together_are_one_line(options, said, capsys, tmp
     err = capsys.readouterr().err
     assert said in err and err.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--estimate", "contact"), "--estimate: a .xosc has variants, no random numbers"),
+        (("--budget", "3000"), "--budget: only with --estimate"),
+    ],
+)
+def test_scenarios_have_no_estimate(options, said, capsys, tmp_path):
+    (tmp_path / "one.xosc").touch()
+    assert cli.main(["sweep", str(tmp_path / "one.xosc"), *options]) == 2
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("command", [["sweep", "paper", "--estimate", "contact"], ["sensitivity", "paper"]])
