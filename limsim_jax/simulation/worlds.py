@@ -75,9 +75,8 @@ class Worlds:
       devices: all local devices by default.
       names: all that the sampler and the run depend on beside shapes. Programs are kept on disk by these
         names; where one is None, they are not.
-      scenarios: scenarios of some seeds, `[B, ...]`, made on the host; in place of those of the sampler.
-      given: what the sampler gets instead of a key: of seeds `[B]`, an array `[B, ...]` on the host, and the
-        seeds of the policies. None: keys are made from the seeds.
+      given: what the sampler gets instead of a key: of seeds `[B]`, arrays `[B, ...]` made on the host, and
+        the seeds of the policies. None: keys are made from the seeds.
     """
 
     def __init__(
@@ -89,7 +88,6 @@ class Worlds:
         chunk: int = 64,
         devices: Sequence[Any] | None = None,
         names: tuple[str | None, str | None] = (None, None),
-        scenarios: Callable[[Sequence[int]], Scenario] | None = None,
         given: Given | None = None,
     ) -> None:
         devices = list(jax.local_devices() if devices is None else devices)
@@ -100,16 +98,13 @@ class Worlds:
         self.lane_map = jax.device_put(lane_map, NamedSharding(self.mesh, PartitionSpec()))
         self.rollout = run
 
-        self._scenarios, self._given = scenarios, given
+        self._given = given
 
         def start(lane_map: LaneMap, of: Any) -> Started:
-            if scenarios is not None:
-                seed, scenario = of
-                return started(run, lane_map, lambda _: scenario, seed)
-            if given is not None:
-                values, seed = of
-                return started(run, lane_map, lambda _: sampler(values), seed)
-            return started(run, lane_map, sampler, of)
+            if given is None:
+                return started(run, lane_map, sampler, of)
+            values, seed = of
+            return started(run, lane_map, lambda _: sampler(values), seed)
 
         def advance(shared: tuple[LaneMap, Int[Array, ""]], world: Started) -> tuple[Started, Result]:
             lane_map, decisions = shared
@@ -159,10 +154,8 @@ class Worlds:
         padded = np.array([*seeds, *[seeds[-1]] * (self.chunk - len(seeds))], np.int32)
         return self._start(self.lane_map, self._inputs(padded))
 
-    def _inputs(self, seeds: Any) -> Any:
+    def _inputs(self, seeds: Int[np.ndarray, " B"]) -> Any:
         """What the worlds of some seeds start from."""
-        if self._scenarios is not None:
-            return jnp.asarray(seeds), self._scenarios(seeds.tolist())
         return jnp.asarray(seeds) if self._given is None else self._given(seeds)
 
     def advance(self, worlds: Started, decisions: int) -> tuple[Started, Result]:

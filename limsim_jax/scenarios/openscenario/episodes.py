@@ -137,8 +137,9 @@ class ScenarioEpisodes(Episodes):
         self.chunk = min(_CHUNK, max(len(self.which), 1)) if chunk is None else chunk
         self.world_bytes = 0
         self.worlds = Worlds(
-            self.rollout, self.lane_map, _no_sampler, chunk=self.chunk, scenarios=self.worlds_of
-        )
+            self.rollout, self.lane_map, lambda world: world, chunk=self.chunk,
+            given=lambda seeds: (self.worlds_of(seeds.tolist()), seeds),
+        )  # fmt: skip
         self.chunk = self.worlds.chunk
 
     @property
@@ -261,10 +262,6 @@ def _as_number(value: Value) -> float | None:
         return float(value)
     except ValueError:
         return None
-
-
-def _no_sampler(key: Any) -> World:
-    raise AssertionError("worlds of a scenario are made on the host")
 
 
 def episodes_of(
