@@ -273,4 +273,13 @@ def check_settings(
     return moments.astype(np.int64)
 
 
-__all__ = ["LEAST", "RUNS", "Method", "RareEvent", "check_settings", "rare_event", "summarise"]
+__all__ = [
+    "LEAST",
+    "LEAST_SAMPLES",
+    "RUNS",
+    "Method",
+    "RareEvent",
+    "check_settings",
+    "rare_event",
+    "summarise",
+]

@@ -10,7 +10,7 @@ import math
 import os
 import platform
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -216,12 +216,22 @@ class Episodes:
 
     def numbers(self, seeds: Sequence[int]) -> NDArray[np.float32]:
         """The random numbers of seeds, `[B, D]`, as values of `layout`."""
+        return np.asarray(self._of_seed[0](np.asarray(seeds, np.int32)))
+
+    def scenario_of(self, seed: int) -> Scenario:
+        """The scenario of a seed, on the host."""
+        return jax.device_get(self._of_seed[1](np.int32(seed)))
+
+    @cached_property
+    def _of_seed(self) -> tuple[Callable[[Any], jax.Array], Callable[[Any], Scenario]]:
+        """Programs: random numbers of seeds, and the scenario of one."""
         layout = self.layout
 
-        def of(seed: jax.Array) -> jax.Array:
-            return layout.values(draw(self._demand, jax.random.split(world_key(seed))[0]))
+        def key(seed: jax.Array) -> jax.Array:
+            return jax.random.split(world_key(seed))[0]
 
-        return np.asarray(jax.jit(jax.vmap(of))(np.asarray(seeds, np.int32)))
+        numbers = jax.vmap(lambda seed: layout.values(draw(self._demand, key(seed))))
+        return jax.jit(numbers), jax.jit(lambda seed: self.sample(key(seed)))
 
     def _measures(self, metrics: tuple[Metric, ...]) -> EvaluateEgo | EvaluateTraffic:
         if not self.egos:

@@ -26,20 +26,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limsim_jax.files import write_whole
-from limsim_jax.rare_events.estimate import RUNS, RareEvent, check_settings, rare_event
+from limsim_jax.rare_events.estimate import LEAST_SAMPLES, RUNS, RareEvent, check_settings, rare_event
 from limsim_jax.rare_events.samplers import LEVEL
 from limsim_jax.statistics import Interval
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.events import Event, event_of
+from limsim_jax.sweeps.numbered import Numbered, lane_of
 from limsim_jax.sweeps.store import NOT_COMPARED, ResultsError
 
 Method = Literal["subset", "crude", "cross-entropy"]
 
 LEAST = 1e-4
 """Probability per episode below which an event is not followed, unless told."""
-
-LEAST_SAMPLES = 20
-"""Worlds per level and run, at least."""
 
 Tell = Callable[[int, int], None]
 """Is told how many worlds have run, and how many will at most."""
@@ -275,34 +273,26 @@ class _Worlds:
     def __init__(self, episodes: Episodes, event: Event, log: _Log, tell: Tell | None, most: int) -> None:
         self.layout = episodes.layout
         self.event, self._log, self._tell, self._most = event, log, tell, most
-        self._values = np.zeros((1, self.layout.size), np.float32)
-        self.episodes = episodes.from_numbers(self.given)
-        self.each = max(episodes.egos, 1)
+        self._worlds = Numbered(episodes)
         self.count, self.ran = 0, 0
         self.exposure: tuple[float, float] | None = None  # hours and km per episode
         self.found: dict[bytes, dict[str, float]] = {}  # metrics of worlds with the event
 
-    def given(self, seeds: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Random numbers of a batch, and the seeds of its policies."""
-        values = self._values[seeds]
-        return values, np.array([zlib.crc32(row.tobytes()) & 0x7FFFFFFF for row in values], np.int32)
-
     def show(self, values: NDArray[np.float32]) -> Episodes:
         """Episodes whose seed k is row k of these random numbers."""
-        self._values = values
-        return self.episodes
+        return self._worlds.show(values, _seeds(values))
 
     def __call__(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         values = self.layout.from_normals(z)
         names, metrics = self._log.batch(values, lambda: self._run(values))
         columns = dict(zip(names, metrics, strict=True))
-        g = self.event.limit(columns).reshape(len(z), self.each)
+        g = self.event.limit(columns).reshape(len(z), -1)
         if self.exposure is None:  # the first batch of every method is of plain worlds
             hours, km = (np.nansum(columns[x]) / len(z) for x in ("duration", "distance"))
             self.exposure = float(hours) / 3600, float(km) / 1e3
         worst = g.argmin(1)
         for k in np.flatnonzero(g.min(1) <= 0):
-            row = int(k) * self.each + int(worst[k])
+            row = int(k) * self._worlds.each + int(worst[k])
             self.found[values[k].tobytes()] = {name: float(x[row]) for name, x in columns.items()}
         self.count += len(z)
         if self._tell is not None:
@@ -310,14 +300,17 @@ class _Worlds:
         return g.min(1)
 
     def _run(self, values: NDArray[np.float32]) -> tuple[list[str], NDArray[np.float64]]:
-        self._values, size, parts = values, self.episodes.chunk, []
-        for first in range(0, len(values), size):
-            outcome = self.episodes.run(range(first, min(first + size, len(values))))
-            parts.append(np.stack(list(outcome.metrics.values())))
-            self.ran += len(outcome.seeds) // self.each
-            if self._tell is not None:
-                self._tell(self.count + min(first + size, len(values)), self._most)
-        return list(self.episodes.units), np.concatenate(parts, 1)
+        tell = self._tell
+        metrics = self._worlds.run(
+            values, _seeds(values), tell and (lambda done: tell(self.count + done, self._most))
+        )
+        self.ran += len(values)
+        return list(metrics), np.stack(list(metrics.values()))
+
+
+def _seeds(values: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Seeds of policies: a function of the random numbers of a world."""
+    return np.array([zlib.crc32(row.tobytes()) & 0x7FFFFFFF for row in values], np.int32)
 
 
 def estimate(
@@ -367,7 +360,7 @@ def estimate(
         shifts=shifts_of(episodes, found),
         worlds=found.calls,
         values=values,
-        episodes=ask.show(values) if len(values) else ask.episodes,
+        episodes=ask.show(values),
     )
     log.write({**done.as_json(), "ran_now": ask.ran, "seconds": round(seconds, 1)})
     if out is not None and len(values):
@@ -434,10 +427,9 @@ def shifts_of(episodes: Episodes, found: RareEvent, most: int = 5) -> tuple[Shif
 
 def _names(episodes: Episodes) -> list[str]:
     """Every random number in words."""
-    ids = episodes.town.lane_ids
     found = []
     for number in episodes.layout.numbers:
-        lane = ids[number.lane] if 0 <= number.lane < len(ids) else "?"
+        lane = lane_of(episodes, number)
         if number.what == "gap":
             found.append(f"gap before arrival {number.place + 1} on lane {lane}")
         elif number.vehicle < episodes.layout.rows:

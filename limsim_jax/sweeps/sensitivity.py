@@ -16,7 +16,7 @@ the value of B (radial design, Campolongo, Saltelli and Cariboni 2011). From the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.statistics import Interval
 from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.numbered import Numbered
 
 RANGE = 1.0
 """Standard deviations by which parameters are shifted, at most, up or down."""
@@ -108,7 +109,12 @@ def parameters_of(episodes: Episodes) -> dict[str, NDArray[np.int64]]:
 
 
 def sensitivity(
-    episodes: Episodes, metrics: Sequence[str], *, seeds: int, seed: int = 0, tell: Any = None
+    episodes: Episodes,
+    metrics: Sequence[str],
+    *,
+    seeds: int,
+    seed: int = 0,
+    tell: Callable[[int, int], None] | None = None,
 ) -> Sensitivity:
     """Slopes and indices of all parameters.
 
@@ -134,7 +140,7 @@ def sensitivity(
     rng = np.random.default_rng(seed)
     a, b = rng.uniform(-RANGE, RANGE, (2, seeds, len(names)))
     base = layout.to_normals(episodes.numbers(range(2 * seeds)))
-    runner = _Runner(episodes)
+    runner = Numbered(episodes)
     rows = []  # of a seed: A, then A with each parameter of B, then another seed under A
     for k in range(seeds):
         shift = np.repeat(a[k][None], len(names) + 2, 0)
@@ -144,18 +150,20 @@ def sensitivity(
         for j, name in enumerate(names):
             world[:, parameters[name]] += shift[:, j : j + 1]
         rows.append(layout.from_normals(world))
-    values = runner(rows, metrics, tell)  # [seeds, P + 2, metrics]
+    worlds = seeds * (len(names) + 2)
+    # the policy draws the same under all shifts of a seed
+    drawn = np.repeat(np.arange(seeds, dtype=np.int32), len(names) + 2)
+    columns = runner.run(np.concatenate(rows), drawn, tell and (lambda done: tell(done, worlds)))
     effects, means = [], {}
-    for m, metric in enumerate(metrics):
-        y = values[..., m]
+    for metric in metrics:
+        # [seeds, P + 2]; of several egos the mean
+        y = columns[metric].reshape(seeds, len(names) + 2, runner.each).mean(-1)
         there = ~np.isnan(y).any(1)  # a metric that is not measured in a world costs its seed
         if there.sum() < LEAST_SEEDS or np.ptp(y[there]) == 0:
             continue
         means[metric] = float(y[there, 0].mean())
         effects += _effects(metric, names, y[there], (b - a)[there])
-    return Sensitivity(
-        episodes.scenario, episodes.policy, seeds, seeds * (len(names) + 2), tuple(effects), means
-    )
+    return Sensitivity(episodes.scenario, episodes.policy, seeds, worlds, tuple(effects), means)
 
 
 def _effects(
@@ -194,28 +202,3 @@ def _effects(
         for j in order
     ]  # fmt: skip
     return [*found, Effect(metric, TRAFFIC, Interval(np.nan, np.nan, np.nan), totals[-1], np.nan)]
-
-
-class _Runner:
-    """Metrics of worlds from their random numbers; of several egos the mean."""
-
-    def __init__(self, episodes: Episodes) -> None:
-        self._values: NDArray[np.float32] = np.zeros((1, episodes.layout.size), np.float32)
-        self._seeds = np.zeros(1, np.int32)
-        self.episodes = episodes.from_numbers(lambda rows: (self._values[rows], self._seeds[rows]))
-
-    def __call__(
-        self, rows: Sequence[NDArray[np.float32]], metrics: Sequence[str], tell: Any
-    ) -> NDArray[np.float64]:
-        count, each = len(rows[0]), max(self.episodes.egos, 1)
-        self._values = np.concatenate(rows)
-        # the policy draws the same under all shifts of a seed
-        self._seeds = np.repeat(np.arange(len(rows), dtype=np.int32), count)
-        found, total = [], len(self._values)
-        for first in range(0, total, self.episodes.chunk):
-            last = min(first + self.episodes.chunk, total)
-            table = self.episodes.run(range(first, last)).metrics
-            found.append(np.stack([table[name].reshape(-1, each).mean(1) for name in metrics], -1))
-            if tell is not None:
-                tell(last, total)
-        return np.concatenate(found).reshape(len(rows), count, len(metrics))

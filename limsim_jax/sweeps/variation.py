@@ -7,12 +7,13 @@ The search runs three batches: all vehicles one by one, then the numbers of thos
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.numbered import Numbered, lane_of
 
 Columns = Mapping[str, NDArray[np.float64]]
 Happened = Callable[[Columns], NDArray[np.bool_]]
@@ -65,39 +66,42 @@ def least_change(episodes: Episodes, seed: int, happened: Happened, *, until: fl
     """
     layout = episodes.layout
     base = layout.to_normals(episodes.numbers([seed]))[0]
-    runner = _Runner(episodes, seed)
+    runner, count = Numbered(episodes), 0
+
+    def happens(worlds: list[NDArray[np.float64]]) -> NDArray[np.bool_]:
+        nonlocal count
+        count += len(worlds)
+        # the policy draws what it drew in the world of the seed
+        metrics = runner.run(layout.from_normals(np.array(worlds)), np.full(len(worlds), seed, np.int32))
+        return np.asarray(happened(metrics).reshape(-1, runner.each).any(1))
+
     groups = _vehicles(episodes, seed, until)
     names = list(groups)
     worlds = [base, *(_towards(base, groups[name], 0.0) for name in names)]
-    found = runner(worlds, happened)
+    found = happens(worlds)
     if not found[0]:
-        return Variation(False, None, (), runner.count)
+        return Variation(False, None, (), count)
     helps = [name for name, still in zip(names, found[1:], strict=True) if not still]
     if not helps:
-        return Variation(True, None, (), runner.count)
+        return Variation(True, None, (), count)
     # the nearer a vehicle is to a typical one, the less is changed
     helps.sort(key=lambda name: float(np.linalg.norm(base[groups[name]])))
     tries = [(name, np.array([k])) for name in helps[:VEHICLES] for k in groups[name]]
-    single = runner([_towards(base, numbers, 0.0) for _, numbers in tries], happened)
+    single = happens([_towards(base, numbers, 0.0) for _, numbers in tries])
     able = [one for one, still in zip(tries, single, strict=True) if not still]
     able += [(name, groups[name]) for name in helps[:VEHICLES]]
     able.sort(key=lambda one: float(np.linalg.norm(base[one[1]])))
     able = able[: 2 * VEHICLES]
     shares = np.arange(1, STEPS) / STEPS  # of the way that is left: 0 is the typical value
     grid = [(one, share) for one in able for share in shares]
-    ends = runner([_towards(base, numbers, share) for (_, numbers), share in grid], happened)
+    ends = happens([_towards(base, numbers, share) for (_, numbers), share in grid])
     changes = []
-    for k, (name, numbers) in enumerate(able):
-        good = [
-            s
-            for s, still in zip(shares, ends[k * len(shares) : (k + 1) * len(shares)], strict=True)
-            if not still
-        ]
-        share = max(good, default=0.0)
+    for (name, numbers), still in zip(able, ends.reshape(len(able), -1), strict=True):
+        share = max(shares[~still], default=0.0)
         what = layout.numbers[int(numbers[0])].what if len(numbers) == 1 else "all numbers"
         size = float(base[numbers[0]]) if len(numbers) == 1 else float(np.linalg.norm(base[numbers]))
         changes.append(Change(what, name, size, size * float(share), numbers))
-    return Variation(True, min(changes, key=lambda x: x.size), tuple(helps), runner.count)
+    return Variation(True, min(changes, key=lambda x: x.size), tuple(helps), count)
 
 
 def _towards(base: NDArray[np.float64], numbers: NDArray[np.int64], share: float) -> NDArray[np.float64]:
@@ -109,48 +113,17 @@ def _towards(base: NDArray[np.float64], numbers: NDArray[np.int64], share: float
 
 def _vehicles(episodes: Episodes, seed: int, until: float) -> dict[str, NDArray[np.int64]]:
     """Numbers of each vehicle that is there by then, and of gaps."""
-    import jax
-
-    from limsim_jax.simulation.rollout import world_key
-
-    layout, ids = episodes.layout, episodes.town.lane_ids
-    scenario = jax.device_get(jax.jit(episodes.sample)(jax.random.split(world_key(seed))[0]))
-    due = np.asarray(scenario.schedule.time)
+    rows, due = episodes.layout.rows, np.asarray(episodes.scenario_of(seed).schedule.time)
     groups: dict[str, list[int]] = {}
-    for k, number in enumerate(layout.numbers):
-        lane = ids[number.lane] if 0 <= number.lane < len(ids) else "?"
+    for k, number in enumerate(episodes.layout.numbers):
+        lane = lane_of(episodes, number)
         if number.what == "gap":
             name = f"arrivals on lane {lane}"
-            groups.setdefault(name, []).append(k)
-        elif number.vehicle < layout.rows:
-            if due[number.vehicle] <= until:
-                name = f"vehicle {number.place + 1} that enters on lane {lane}"
-                groups.setdefault(name, []).append(k)
+        elif number.vehicle >= rows:
+            name = f"the vehicle in place {number.vehicle - rows + 1}, lane {lane}"
+        elif due[number.vehicle] <= until:
+            name = f"vehicle {number.place + 1} that enters on lane {lane}"
         else:
-            groups.setdefault(
-                f"the vehicle in place {number.vehicle - layout.rows + 1}, lane {lane}", []
-            ).append(k)
+            continue
+        groups.setdefault(name, []).append(k)
     return {name: np.array(numbers) for name, numbers in groups.items()}
-
-
-class _Runner:
-    """Whether an event happens in worlds given by their normals; it counts them."""
-
-    def __init__(self, episodes: Episodes, seed: int) -> None:
-        self._values: NDArray[np.float32] = np.zeros((1, episodes.layout.size), np.float32)
-        self._layout, self._seed, self.count = episodes.layout, seed, 0
-        self.episodes = episodes.from_numbers(self._given)
-
-    def _given(self, rows: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        # the policy draws what it drew in the world of the seed
-        return self._values[rows], np.full(len(rows), self._seed, np.int32)
-
-    def __call__(self, worlds: list[NDArray[np.float64]], happened: Happened) -> NDArray[np.bool_]:
-        self._values = self._layout.from_normals(np.array(worlds))
-        each, found = max(self.episodes.egos, 1), []
-        for first in range(0, len(worlds), self.episodes.chunk):
-            rows = range(first, min(first + self.episodes.chunk, len(worlds)))
-            metrics = self.episodes.run(rows).metrics
-            found.append(happened(metrics).reshape(-1, each).any(1))
-        self.count += len(worlds)
-        return np.concatenate(found)

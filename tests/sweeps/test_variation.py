@@ -37,7 +37,7 @@ class TwoParameters:
         rows = [np.random.default_rng(seed).standard_normal(self.layout.size) for seed in seeds]
         return self.layout.from_normals(np.array(rows))
 
-    def sample(self, key):
+    def scenario_of(self, seed):
         return SimpleNamespace(schedule=SimpleNamespace(time=np.array([1.0, 2.0, 3.0, 99.0])))
 
     def from_numbers(self, given):
@@ -56,14 +56,6 @@ class TwoParameters:
 
 def of(layout, what, vehicle=None):
     return [k for k, x in enumerate(layout.numbers) if x.what == what and vehicle in (None, x.vehicle)]
-
-
-@pytest.fixture(autouse=True)
-def plain_sampling(monkeypatch):
-    """The double's scenario needs no compiler."""
-    import jax
-
-    monkeypatch.setattr(jax, "jit", lambda f, **_: f)
 
 
 def hits(metrics):
