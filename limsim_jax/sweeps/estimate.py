@@ -20,7 +20,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +47,10 @@ def worlds_per_level(worlds: int, method: Method, least: float, runs: int = RUNS
     """Worlds per level and run; at most `worlds` run in all.
 
     Raises:
-      ValueError: too few.
+      ValueError: too few, or an unknown method; one line.
     """
+    if method not in get_args(Method):
+        raise ValueError(f"method: '{method}'; known are {', '.join(get_args(Method))}")
     if not 0 < least < 1:
         raise ValueError(f"least: {least:g}; a probability between 0 and 1, such as {LEAST:g}")
     levels = max(round(np.log(least) / np.log(LEVEL)), 1)
@@ -210,6 +212,7 @@ class _Log:
         index = folder / "estimate.json"
         if fresh and index.exists():
             shutil.rmtree(folder / "worlds", ignore_errors=True)
+            (folder / "failures.npz").unlink(missing_ok=True)
             index.unlink()
         if (folder / "results.json").exists():
             raise ResultsError(f"{folder}: holds the results of a sweep; name another folder with --out")

@@ -158,6 +158,13 @@ def test_a_damaged_batch_runs_again(tmp_path):
     assert 0 < again.counter[0] < 200
 
 
+def test_a_fresh_estimate_leaves_no_failures_of_another(tmp_path):
+    estimate(NumberedEpisodes(1e-2), "contact", tmp_path, worlds=2_000)
+    assert (tmp_path / "failures.npz").exists()
+    estimate(NumberedEpisodes(1e-12, "2"), "contact", tmp_path, worlds=2_000, least=1e-3, fresh=True)
+    assert not (tmp_path / "failures.npz").exists()
+
+
 def test_another_estimate_needs_another_folder(tmp_path):
     estimate(NumberedEpisodes(1e-2), "contact", tmp_path, worlds=2_000)
     with pytest.raises(ResultsError, match=r"made with event = contact, now min_ttc<1; use another folder"):
@@ -180,6 +187,8 @@ FAULTS = [
     ("contact", {"worlds": 100}, "worlds: 100 are too few for subset down to 0.0001; at least 1100"),
     ("contact", {"worlds": 100, "method": "crude"}, "worlds: 100 are too few for crude"),
     ("contact", {"runs": 2}, "runs: 2; at least 10"),
+    ("contact", {"method": "auto"}, "method: 'auto'; known are subset, crude, cross-entropy"),
+    ("contact", {"method": "splitting"}, "method: 'splitting'; known are subset"),
     ("contact", {"least": 2.0}, "least: 2; a probability between 0 and 1"),
     ("contact", {"level": 95.0}, "the level must lie between 0 and 1"),
 ]
