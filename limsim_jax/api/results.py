@@ -287,13 +287,19 @@ def rebuild(stored: Stored, scenario: str, policy: str, *, cores: int | None = N
     """The worlds of stored results, from what is stored about them.
 
     Raises:
-      ResultsError: they hang on a Python value (a policy, drivers, metrics) that a folder does not hold.
+      ResultsError: they hang on a Python value (a policy, drivers, metrics) that a folder does not hold, or
+        are variants of an OpenSCENARIO file.
     """
     from limsim_jax.sweeps.episode import Episodes
     from limsim_jax.sweeps.experiment import ExperimentFile
     from limsim_jax.xla import use_all_cores
 
     about = stored.provenance[scenario, policy]
+    if "openscenario" in about:
+        raise ResultsError(
+            f"{stored.path}: {scenario} ({policy}) are variants of {about['openscenario_file']}, and a "
+            "folder of results cannot make their worlds again"
+        )
     values = [name for name in ("policy", "model", "metrics") if name in about]
     values += ["drivers"] if isinstance(about.get("drivers"), dict) else []
     if values:

@@ -55,8 +55,8 @@ def triage(
       results: of the sweep.
       scenario, policy: names; None: all.
       most: groups whose representative is changed and shown, the largest ones.
-      change: look for changes, and write replays beside the page. Results with values from Python that a
-        folder does not hold have groups only.
+      change: look for changes, and write replays beside the page. Results whose worlds a folder cannot make
+        again (values from Python, variants of a .xosc) have groups only.
       page: HTML page to write; None: none.
     """
     findings: list[Finding] = []
@@ -68,7 +68,7 @@ def triage(
             worlds = results.worlds_of(*group) if change and found else None
             said = ""
         except ResultsError:
-            worlds, said = None, "not looked for: made with values from Python"
+            worlds, said = None, "not looked for: the folder cannot make its worlds again"
         for k, cluster in enumerate(found):
             if worlds is None or k >= most:
                 findings.append(Finding(cluster, said, ""))

@@ -5,12 +5,13 @@ import pytest
 import xosc
 from osc_worlds import play, road
 
+from limsim_jax.api.results import rebuild
 from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.scenarios.openscenario.episodes import episodes_of
 from limsim_jax.scenarios.openscenario.scenario import openscenario
 from limsim_jax.scenarios.openscenario.source import OpenScenarioError
 from limsim_jax.sweeps import runner
-from limsim_jax.sweeps.store import open_results
+from limsim_jax.sweeps.store import ResultsError, open_results
 
 ACTIVATE = (
     '<PrivateAction><ControllerAction><ActivateControllerAction longitudinal="true" lateral="true"/>'
@@ -56,10 +57,13 @@ def test_variants_are_worlds_of_a_sweep(tmp_path):
     summary = runner.sweep([episodes], range(3), out)
     assert summary.parts[0].ran == 3
     assert runner.sweep([episodes], range(3), out).parts[0].ran == 0  # they are on disk
-    rows = open_results(out).episodes.to_pydict()
+    results = open_results(out)
+    rows = results.episodes.to_pydict()
     assert rows["parameter_gap"] == [8, 40, 500]
     assert rows["scenario_ended"] == [1, 1, 1]
     assert rows["passed"][1:] == [1, 1]
+    with pytest.raises(ResultsError, match=r"are variants of .*cuts\.xosc, and a folder of results cannot"):
+        rebuild(results, *next(iter(results.provenance)))
 
     # B is where it is without traffic, and the ego is held until its controller is active
     trace = episodes.worlds.replay(episodes.worlds.start([1])).trace
