@@ -91,6 +91,11 @@ def test_import_is_light():
     assert run(f"import sys, limsim_jax; print([m for m in {heavy} if m in sys.modules])").strip() == "[]"
 
 
+def test_results_are_read_without_jax():
+    """Tables of a sweep need Parquet; what runs worlds again is loaded when that is asked for."""
+    assert run("import sys, limsim_jax.api.results; print('jax' in sys.modules)").strip() == "False"
+
+
 @pytest.mark.engine
 def test_no_import_starts_a_backend():
     """Not even importing every module of the package."""

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from limsim_jax.policies.language.driver import offline
-from limsim_jax.sweeps.answers import recall, stored_answers
 from limsim_jax.sweeps.store import Results as Stored
 from limsim_jax.sweeps.store import ResultsError
 from limsim_jax.sweeps.store import open_results as open_stored
@@ -169,9 +167,7 @@ class Results:
             group, seed, ego = self._group(scenario, policy), row, 0
         else:
             group, seed, ego = (row["scenario"], row["policy"]), row["seed"], row.get("ego", 0)
-        worlds = self.worlds_of(*group)
-        recall(worlds, self.path, [seed])
-        return World.run(worlds, seed, ego)
+        return World.run(self._recalled(*group, [seed]), seed, ego)
 
     def answers(self, seed: int, *, scenario: str | None = None, policy: str | None = None) -> list[Answer]:
         """What a language model answered in a world; empty where none drove.
@@ -180,6 +176,8 @@ class Results:
           seed: of the world.
           scenario, policy: names, where the results hold several.
         """
+        from limsim_jax.sweeps.answers import stored_answers
+
         return stored_answers(self.path, *self._group(scenario, policy), seed)
 
     def trajectories(
@@ -201,9 +199,9 @@ class Results:
             raise ValueError(f"no scenario '{scenario}' with policy '{policy}'; there are {self._groups()}")
         parts = []
         for group in groups:
-            recall(self.worlds_of(*group), self.path, seeds)
+            worlds = self._recalled(*group, seeds)
             for seed in seeds:
-                part = World.run(self.worlds_of(*group), seed, explain=False).trajectories()
+                part = World.run(worlds, seed, explain=False).trajectories()
                 for place, (name, value) in enumerate(zip(("scenario", "policy"), group, strict=True)):
                     part = part.add_column(place, name, pa.array([value] * part.num_rows))
                 parts.append(part)
@@ -215,6 +213,14 @@ class Results:
         if group not in self._made:
             self._made[group] = rebuild(self.stored, *group)
         return self._made[group]
+
+    def _recalled(self, scenario: str, policy: str, seeds: Sequence[int]) -> Episodes:
+        """The same, ready to run these seeds: a language model says again what it said."""
+        from limsim_jax.sweeps.answers import recall
+
+        worlds = self.worlds_of(scenario, policy)
+        recall(worlds, self.path, seeds)
+        return worlds
 
     def report(self, path: str | Path | None = None, *, worst: int = 6) -> Path:
         """Write the report as an HTML page.
@@ -228,8 +234,7 @@ class Results:
         from limsim_jax.report.page import write_report
 
         def again(scenario: str, policy: str, seeds: Sequence[int]) -> Sequence[tuple[Any, ...]]:
-            worlds = self.worlds_of(scenario, policy)
-            recall(worlds, self.path, seeds)
+            worlds = self._recalled(scenario, policy, seeds)
             return worlds.replays([(seed, 0) for seed in seeds], brief=True)
 
         target = self.path / "report.html" if path is None else Path(path)
@@ -290,6 +295,7 @@ def rebuild(stored: Stored, scenario: str, policy: str, *, cores: int | None = N
       ResultsError: they hang on a Python value (a policy, drivers, metrics) that a folder does not hold, or
         are variants of an OpenSCENARIO file.
     """
+    from limsim_jax.policies.language.driver import offline
     from limsim_jax.sweeps.episode import Episodes
     from limsim_jax.sweeps.experiment import ExperimentFile
     from limsim_jax.xla import use_all_cores

@@ -20,8 +20,7 @@ from limsim_jax.policies.language.driver import language_drivers
 from limsim_jax.policies.language.store import Answer, read_answers
 from limsim_jax.policies.several import Several
 from limsim_jax.simulation.rollout import decision_key
-
-FOLDER = "answers"
+from limsim_jax.sweeps.store import answers_file
 
 
 class Notes:
@@ -107,11 +106,6 @@ def of_rows(
     """The answers of each row of results."""
     rows = zip(seeds.tolist(), egos.tolist(), strict=True)
     return [[x for x in answers.get(seed, ()) if x.ego == ego] for seed, ego in rows]
-
-
-def answers_file(path: Path, scenario: str, policy: str, seed: int) -> Path:
-    """Where the answers in a world of results lie."""
-    return path / FOLDER / scenario / policy / f"{seed}.jsonl"
 
 
 def stored_answers(path: Path, scenario: str, policy: str, seed: int) -> list[Answer]:

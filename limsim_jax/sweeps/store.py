@@ -3,7 +3,7 @@
     OUT/results.json                                          what the directory holds, and how it was made
     OUT/<scenario>/<policy>/moments-<first>-<last>.parquet    key moments of a chunk of seeds
     OUT/<scenario>/<policy>/episodes-<first>-<last>.parquet   its rows; once this is there, the chunk is done
-    OUT/answers/<scenario>/<policy>/<seed>.jsonl              what a language model said, see `sweeps.answers`
+    OUT/answers/<scenario>/<policy>/<seed>.jsonl              what a language model said, a line each
 
 `<first>` and `<last>` are the least and the largest seed; a chunk with gaps between has a checksum of its
 seeds behind them. Every file carries its provenance and a SHA-256 of all that it says, so a changed byte is
@@ -27,7 +27,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -35,8 +35,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from limsim_jax.files import write_whole
-from limsim_jax.policies.language.store import Answer, lines_of
-from limsim_jax.sweeps.answers import FOLDER, answers_file
+
+if TYPE_CHECKING:  # results are read without JAX, which the room of policies loads
+    from limsim_jax.policies.language.store import Answer
 
 FORMAT = 2
 """Version of the layout of a results directory."""
@@ -314,9 +315,14 @@ def _remove(path: Path, entries: Sequence[Entry]) -> None:
             for file in sorted((path / entry.scenario / entry.policy).glob(f"{kind}-*.parquet")):
                 with _clear(file), contextlib.suppress(FileNotFoundError):
                     file.unlink()
-        for file in sorted((path / FOLDER / entry.scenario / entry.policy).glob("*.jsonl")):
+        for file in sorted(answers_file(path, entry.scenario, entry.policy, 0).parent.glob("*.jsonl")):
             with _clear(file), contextlib.suppress(FileNotFoundError):
                 file.unlink()
+
+
+def answers_file(path: Path, scenario: str, policy: str, seed: int) -> Path:
+    """Where the answers in a world of results lie."""
+    return path / "answers" / scenario / policy / f"{seed}.jsonl"
 
 
 def _listed(path: Path) -> Iterator[Entry]:
@@ -414,6 +420,8 @@ class Shards:
         Raises:
           ResultsError: it cannot be written (disk full, no permission). What was finished stays.
         """
+        from limsim_jax.policies.language.store import lines_of
+
         name = _stem(np.unique(np.asarray(outcome.seeds, np.int64)))
         about = _about(self.entry)
         for seed, answers in outcome.answers.items():

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from limsim_jax.policies.language.store import Answer
+if TYPE_CHECKING:
+    from limsim_jax.policies.language.store import Answer
 
 
 def answer_rows(answers: Iterable[Answer]) -> list[dict[str, Any]]:

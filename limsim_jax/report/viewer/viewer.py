@@ -15,7 +15,7 @@ import math
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -26,7 +26,6 @@ from limsim_jax.maps.lane_map import VEHICLE_CLASSES, LaneMap, absolute, lane_id
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.metrics.moments import RESPONSIBLE, value_text, words
-from limsim_jax.policies.language.store import Answer
 from limsim_jax.report.frames import COLLIDED, DRIVEN, EGO, SIGNALS
 from limsim_jax.report.strip import FilmLike
 from limsim_jax.report.templates import read, render
@@ -38,6 +37,9 @@ from limsim_jax.report.viewer.traffic import add_driven, add_traffic
 from limsim_jax.simulation.ending import ending, shown_steps
 from limsim_jax.simulation.trace import Trace
 from limsim_jax.types import Status
+
+if TYPE_CHECKING:
+    from limsim_jax.policies.language.store import Answer
 
 SUFFIXES = (".html", ".htm")
 
