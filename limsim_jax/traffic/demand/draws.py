@@ -27,9 +27,6 @@ _ARRIVALS, _SEATS, _ROLES, _VEHICLES = range(4)
 _LATENT = 3
 """Numbers of a vehicle before those of its parameters: its type, and what parameters have in common."""
 
-_ALWAYS = 500.0
-"""Logarithm of a weight from which on a seat is always taken, or never: it pads a table."""
-
 Kind = Literal["uniform", "gumbel", "normal"]
 
 
@@ -122,9 +119,8 @@ class Layout:
         lane, place = (np.asarray(x) for x in queue_lanes(demand))
         lane = np.concatenate([lane, host.seat_lane])
         place = np.concatenate([place, np.zeros(seats, int)])
-        open_seats = (
-            np.flatnonzero(np.abs(host.seat_weight) < _ALWAYS) if demand.initial else np.zeros(0, int)
-        )
+        possible = (host.seat_lane != NO_LANE) & np.isfinite(host.seat_weight)  # others pad the table
+        open_seats = np.flatnonzero(possible & (demand.initial > 0))
         vehicles = np.concatenate([np.flatnonzero(lane[:rows] != NO_LANE), rows + open_seats])
         spread = np.asarray(host.population.spread)[np.asarray(host.population.share) > 0]
         columns = [_LATENT + k for k in np.flatnonzero((spread > 0).any(0))]
