@@ -159,9 +159,10 @@ class Rollout:
                 measured = measure.update(config, lanes, measured, records)
             totals, stood = count(config, totals, stood, state, after)
             new = Carry(after, memory, totals, stood, measured)
-            if self.traffic.after_collision == "end" or state.outside is not None:
-                over = collided(state) if self.traffic.after_collision == "end" else jnp.bool_(False)
-                over = over if state.outside is None else over | state.outside.over
+            ends = [collided(state)] if self.traffic.after_collision == "end" else []
+            ends += [] if state.outside is None else [state.outside.over]
+            if ends:
+                over = jnp.stack(ends).any()
                 new = jax.tree.map(lambda x, y: jnp.where(over, x, y), carry, new)
             return new, kept
 

@@ -30,7 +30,7 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, pose, project,
 from limsim_jax.numerics import safe_divide, safe_norm
 from limsim_jax.traffic.bodies import body_place
 from limsim_jax.traffic.car_following import ballistic
-from limsim_jax.types import Config, Egos, State
+from limsim_jax.types import Config, Egos, Outside, State
 from limsim_jax.xla import interval
 
 _AGAINST = 3.5  # m: a lane fits worse by this much if the ego points against it
@@ -333,14 +333,24 @@ def overlay_boxes(state: State, box: Float[Array, "N 5"]) -> Float[Array, "N 5"]
 
     Those are free egos and vehicles from outside.
     """
-    egos = state.egos
-    place = [at_slots(egos, v, box[:, k], egos.free) for k, v in enumerate((egos.x, egos.y, egos.heading))]
-    outside = state.outside
-    if outside is not None:
-        mine = replace(egos, slot=outside.slot, free=outside.held & outside.there & (outside.slot >= 0))
-        poses = outside.x, outside.y, outside.heading
-        place = [at_slots(mine, v, place[k], mine.free) for k, v in enumerate(poses)]
+    place = list(box[:, :3].T)
+    for rows in [state.egos] if state.outside is None else [state.egos, outside_rows(state.outside)]:
+        poses = rows.x, rows.y, rows.heading
+        place = [at_slots(rows, v, place[k], rows.free) for k, v in enumerate(poses)]
     return jnp.concatenate([jnp.stack(place, -1), box[:, 3:]], -1)
+
+
+def outside_rows(outside: Outside) -> Egos:
+    """Vehicles from outside as rows of `Egos`; free are those that are moved from outside."""
+    return Egos(
+        slot=outside.slot,
+        free=outside.held & outside.there & (outside.slot >= 0),
+        x=outside.x,
+        y=outside.y,
+        heading=outside.heading,
+        steering=jnp.zeros_like(outside.x),
+        a=outside.a,
+    )
 
 
 def from_lane(

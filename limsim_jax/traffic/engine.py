@@ -469,12 +469,14 @@ def _step(
         moved = put(config, lane_map, before, moved, outside)
         dx, left = jnp.where(held, moved.distance - before.distance, dx), left & ~held
     state = replace(moved, step=before.step + 1)
-    if outside is not None:
-        box = computed_once(boxes(lane_map, state))
-        state = replace(state, outside=replace(outside, box=box[outside.slot]))
-    if traffic.look_for_contacts != "step":
+    looks = traffic.look_for_contacts == "step"
+    if not looks and outside is None:
         return state, dx, left, None, None
     box = computed_once(boxes(lane_map, state))
+    if outside is not None:
+        state = replace(state, outside=replace(outside, box=box[outside.slot]))
+    if not looks:
+        return state, dx, left, None, None
     state, off = record_events(config, lane_map, state, box, free=may_be_free)
     return state, dx, left, box, off
 

@@ -15,42 +15,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
-from limsim_jax.traffic.ego import at_slots, find_lane
+from limsim_jax.traffic.ego import at_slots, find_lane, outside_rows
 from limsim_jax.types import Config, Egos, Outside, State
 
 Player = Callable[[Config, Any, State], Outside]
 """Moves vehicles on by a physics step: given the run, what the schedule says of them, and the world now."""
 
 
-def rows(outside: Outside) -> Egos:
-    """Vehicles from outside as rows of `Egos`, to look up their lanes."""
-    nothing = jnp.zeros_like(outside.x)
-    return Egos(
-        slot=outside.slot,
-        free=outside.held & outside.there & (outside.slot >= 0),
-        x=outside.x,
-        y=outside.y,
-        heading=outside.heading,
-        steering=nothing,
-        a=outside.a,
-    )
-
-
 def is_held(state: State) -> Bool[Array, " N"]:
     """Slots of vehicles that are moved from outside now."""
     if state.outside is None:
         return jnp.zeros_like(state.active)
-    mine = rows(state.outside)
+    mine = outside_rows(state.outside)
     return at_slots(mine, mine.free, jnp.zeros_like(state.active))
-
-
-def reserved(state: State) -> Bool[Array, " N"]:
-    """Slots that belong to vehicles from outside."""
-    none = jnp.zeros_like(state.active)
-    if state.outside is None:
-        return none
-    mine = rows(state.outside)
-    return at_slots(mine, mine.slot >= 0, none)
 
 
 @jax.named_scope("outside")
@@ -64,10 +41,10 @@ def put(config: Config, lane_map: LaneMap, before: State, moved: State, outside:
       moved: after it, as the traffic has moved all vehicles.
       outside: after it.
     """
-    egos = rows(outside)
+    egos = outside_rows(outside)
     slot = egos.slot
     mine = egos.free
-    was = rows(outside) if before.outside is None else rows(before.outside)
+    was = outside if before.outside is None else before.outside
     way = jnp.hypot(outside.x - was.x, outside.y - was.y)
     seen = replace(before, egos=egos)
     place = find_lane(lane_map, seen, outside.x, outside.y, outside.heading, way)

@@ -68,6 +68,10 @@ class Placed:
     signalled: bool = False
 
 
+class NoPlace(InstructionError):
+    """None of the maps has a place for a scenario."""
+
+
 class _NoRoom(Exception):
     """This place does not do; the reason."""
 
@@ -81,7 +85,8 @@ def place(intent: Intent, maps: Sequence[Map], tuning: Tuning = NO_TUNING) -> Pl
       tuning: what is changed because it did not work before.
 
     Raises:
-      InstructionError: none of the maps has such a place; one line with the reason.
+      NoPlace: none of the maps has such a place; one line with the reason.
+      InstructionError: it needs another kind of road.
     """
     seen: list[str] = []
     number = 0
@@ -100,8 +105,8 @@ def place(intent: Intent, maps: Sequence[Map], tuning: Tuning = NO_TUNING) -> Pl
                 break
         seen.append(f"{town.name}: {reason}")
     if number:
-        raise InstructionError(f"only {number} places fit")
-    raise InstructionError(f"no map has a place for this; {'; '.join(dict.fromkeys(seen))}")
+        raise NoPlace(f"only {number} places fit")
+    raise NoPlace(f"no map has a place for this; {'; '.join(dict.fromkeys(seen))}")
 
 
 def _spots(intent: Intent, town: Map) -> Iterator[Corridor | Meeting | Merge]:

@@ -261,8 +261,8 @@ def plan(actor: Actor, ego: float, tuning: Tuning, intent: Intent) -> Plan:
     if bad or actor.place == "oncoming":
         word = bad[0].replace("_", " ") if bad else "oncoming"
         raise InstructionError(f"'{word}' needs a junction or a ramp, not a stretch of road")
-    lead = next((kind for kind in _LEADING if kind in kinds), None)
-    act = actor.acts[kinds.index(lead)] if lead else actor.acts[0] if actor.acts else Act(kind="drive")
+    lead = next((kind for kind in _LEADING if kind in kinds), kinds[0] if kinds else "drive")
+    act = actor.acts[kinds.index(lead)] if kinds else Act(kind="drive")
     case = _Case(
         actor=actor, act=act, ego=ego, tuning=tuning,
         v=speed_of(actor, ego, -SLOWER if lead == "cut_in" else 0.0),
@@ -270,7 +270,7 @@ def plan(actor: Actor, ego: float, tuning: Tuning, intent: Intent) -> Plan:
         gap=None if actor.gap is None else middle(actor.gap, 0.0),
         length=LENGTHS[actor.kind], stands=_stands_at(actor, intent, ego),
     )  # fmt: skip
-    found = _LEADING[lead or "drive"](case) if lead else _drive(case)
+    found = _LEADING.get(lead, _drive)(case)
     found.actions += _speeds(actor, found.v, case.time, len(found.actions) > 1)
     return found
 

@@ -16,7 +16,15 @@ from limsim_jax.maps.map import Map, load_map
 from limsim_jax.scenarios.instructions.events import happened
 from limsim_jax.scenarios.instructions.grammar import parse
 from limsim_jax.scenarios.instructions.intent import InstructionError, Intent, RoadKind
-from limsim_jax.scenarios.instructions.place import AT_LIGHTS, DENSITY, HORIZON, NO_TUNING, Placed, place
+from limsim_jax.scenarios.instructions.place import (
+    AT_LIGHTS,
+    DENSITY,
+    HORIZON,
+    NO_TUNING,
+    NoPlace,
+    Placed,
+    place,
+)
 from limsim_jax.scenarios.instructions.plans import Tuning
 from limsim_jax.scenarios.instructions.straight import write_straight
 from limsim_jax.sweeps.episode import Episodes
@@ -264,9 +272,7 @@ def _maps(intent: Intent, given: str | Path | Map | None, folder: Path) -> list[
 def _fits(intent: Intent, maps: Sequence[Map]) -> bool:
     try:
         place(intent, maps)
-    except InstructionError as error:
-        if "no map has a place" not in str(error):
-            raise
+    except NoPlace:
         return False
     return True
 
