@@ -60,6 +60,7 @@ def scenario(
         raise InstructionError(f"{path}: is there already; name another file with --out")
     if model and server is None:
         raise typer.BadParameter("only with --server", param_hint="--model")
+    path.parent.mkdir(parents=True, exist_ok=True)  # before minutes of trials, in case it cannot be made
     understand = parse if server is None else LanguageModel(Server(server, model, key))
     found = make(
         text, map=map_file, folder=path.parent, seeds=seeds, understand=understand,

@@ -204,7 +204,9 @@ def test_a_straight_road_is_read_as_it_was_meant(tmp_path):
 
 
 def test_without_a_place_the_reason_is_said(highway):
-    with pytest.raises(InstructionError, match="no map has a place for this; highway: no such road"):
+    with pytest.raises(
+        InstructionError, match="no map has a place for this; highway: no junction as it is asked for"
+    ):
         place(parse("A car comes from the right"), [highway])
     with pytest.raises(InstructionError, match="'cross' needs a junction"):
         place(parse("On a motorway a car crosses the road"), [highway])
@@ -346,6 +348,9 @@ def test_the_command_writes_a_file_and_says_what_is_wrong_in_a_line(monkeypatch,
         assert said in error, error
         assert error.count("\n") == 1
     assert (tmp_path / "car_brakes_hard_two_lane_motorway.toml").read_bytes() == before
+    new = ["scenario", "A car brakes on a motorway", "--seeds", "0", "--out", "new/x.toml"]
+    assert main(new) in (0, None)
+    assert (tmp_path / "new" / "x.toml").exists()
 
 
 # ---- a language model

@@ -53,6 +53,13 @@ SPEEDS = {"motorway": 25.0, "ramp": 25.0, "rural": 22.0, "town": 12.0, "crossing
 """m/s of the ego, unless the instruction or the limit says less."""
 
 
+_WORDS = {
+    "motorway": "motorway", "rural": "rural road", "town": "street", "ramp": "ramp", "crossing": "junction",
+    "roundabout": "roundabout",
+}  # fmt: skip
+"""Kinds of roads in messages."""
+
+
 @dataclass
 class Placed:
     """A scenario on a map: fields of an experiment."""
@@ -91,7 +98,7 @@ def place(intent: Intent, maps: Sequence[Map], tuning: Tuning = NO_TUNING) -> Pl
     seen: list[str] = []
     number = 0
     for town in maps:
-        reason = "no such road"
+        reason = f"no {_WORDS[intent.kind_of_road]} as it is asked for"
         for spot in _spots(intent, town):
             try:
                 found = _on(intent, spot, tuning)

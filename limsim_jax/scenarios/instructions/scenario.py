@@ -111,6 +111,7 @@ class Scenario:
     def save(self, path: str | Path) -> Path:
         """Write the experiment as .toml."""
         path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, to_toml(self, path.parent))
         return path
 

@@ -55,5 +55,6 @@ def write_straight(folder: Path, kind: RoadKind, lanes: int) -> Path:
         "</laneSection></lanes></road></OpenDRIVE>\n"
     )
     path = folder / f"{kind}_{lanes}.xodr"
+    folder.mkdir(parents=True, exist_ok=True)
     write_whole(path, text)
     return path
