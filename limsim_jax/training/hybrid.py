@@ -302,7 +302,6 @@ def train(
     seen, unseen = (jax.tree.map(lambda x, which=which: x[which], samples) for which in (learns, ~learns))
     weights = fit(seen, hidden=hidden, epochs=epochs, tell=tell)
     save_weights(out, weights)
-    load_weights.cache_clear()
     after = Offset(hidden).apply({"params": load_weights(str(out))}, unseen.features)
     return Report(
         samples=len(seen.future),

@@ -313,8 +313,9 @@ def refused(match, **options):
 def test_bad_weights_are_refused_in_one_line(tmp_path):
     refused("nowhere.npz: no weights: No such file", weights=str(tmp_path / "nowhere.npz"))
     text = tmp_path / "text.npz"
-    text.write_text("hello")
-    refused("text.npz: no weights of an end-to-end driver", weights=str(text))
+    for content in ("", "hello"):
+        text.write_text(content)
+        refused("text.npz: no weights of an end-to-end driver", weights=str(text))
     other = tmp_path / "other.npz"
     np.savez(other, kernel=np.zeros(3))
     refused("other.npz: no weights of an end-to-end driver", weights=str(other))

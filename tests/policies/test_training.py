@@ -21,6 +21,7 @@ from limsim_jax.policies.pdm.learned import (
     remember,
     save_weights,
 )
+from limsim_jax.sweeps.identity import describe
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.training import Samples, errors, fit, train
@@ -136,8 +137,27 @@ def test_wrong_files_of_weights_are_named(tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(ValueError, match=r"other\.npz: layers that see"):
         PDMHybrid(weights=str(tmp_path / "other.npz"))
+    whole = learned.WEIGHTS.read_bytes()
+    for content in (b"", b"hello", whole[: len(whole) // 2]):
+        (tmp_path / "broken.npz").write_bytes(content)
+        with pytest.raises(ValueError, match=r"broken\.npz: no weights of PDM-Hybrid"):
+            PDMHybrid(weights=str(tmp_path / "broken.npz"))
     with pytest.raises(ValueError, match="0 seeds to learn from"):
         train(tmp_path / "w.npz", seeds=0)
+
+
+def test_a_file_that_is_trained_again_is_another_policy(tmp_path):
+    file = str(tmp_path / "w.npz")
+    some = made_up(1)
+    first, second = (Offset(8).init(jax.random.key(seed), some.features)["params"] for seed in (0, 1))
+    save_weights(file, first)
+    old, same = PDMHybrid(weights=file), PDMHybrid(weights=file)
+    save_weights(file, second)
+    new = PDMHybrid(weights=file)
+    assert old == same != new and describe(old) == describe(same) != describe(new)
+    for policy, weights in ((old, first), (new, second)):  # each drives as what it read
+        kernel = weights["Dense_0"]["kernel"]
+        np.testing.assert_allclose(policy.network["Dense_0"]["kernel"], kernel, rtol=2e-3, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -10,11 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
-import io
 import json
-import zipfile
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,11 +19,11 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from limsim_jax.files import write_whole
 from limsim_jax.policies.end_to_end.inputs import BANDS, EGO, LIDAR_RANGE, POINTS, RASTER, STEP, Inputs
+from limsim_jax.policies.weights import Layers, pack, unpack
 
 PATH_POINTS = 10
 """Points of the predicted path."""
@@ -267,15 +263,8 @@ def fresh_weights(design: Design = WHOLE, seed: int = 0) -> Any:
 
 def save_weights(path: str | Path, trained: Trained) -> None:
     """Write a network as .npz, in half precision and atomically."""
-    flat = {
-        f"{layer}/{name}": np.asarray(value, np.float16)
-        for layer, values in trained.weights.items()
-        for name, value in values.items()
-    }
     told = {"format": _MAGIC, "design": dataclasses.asdict(trained.design), "about": trained.about}
-    file = io.BytesIO()
-    np.savez_compressed(file, about=np.array(json.dumps(told)), **flat)  # pyright: ignore[reportArgumentType]
-    write_whole(path, file.getvalue())
+    write_whole(path, pack(trained.weights, about=json.dumps(told)))
 
 
 def load_weights(path: str) -> Trained:
@@ -288,36 +277,25 @@ def load_weights(path: str) -> Trained:
         content = Path(path).read_bytes()
     except OSError as error:
         raise ValueError(f"{path}: no weights: {error.strerror}") from None
-    return _read(path, content)
-
-
-@functools.lru_cache(maxsize=8)
-def _read(path: str, content: bytes) -> Trained:
     try:
-        with np.load(io.BytesIO(content)) as file:
-            told = json.loads(str(file["about"]))
-            flat = {name: np.asarray(file[name], np.float32) for name in file.files if name != "about"}
+        weights, texts = unpack(content)
+        told = json.loads(texts["about"])
         if told["format"] != _MAGIC:
             raise KeyError("format")
         design = Design(**told["design"])
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: no weights of an end-to-end driver: {error}") from None
-    weights: dict[str, dict[str, np.ndarray]] = {}
-    for name, value in flat.items():
-        layer, _, part = name.partition("/")
-        weights.setdefault(layer, {})[part] = value
     check_weights(path, design, weights)
     return Trained(design, weights, told["about"])
 
 
-def check_weights(path: str, design: Design, weights: Mapping[str, Mapping[str, Any]]) -> None:
+def check_weights(path: str, design: Design, weights: Layers) -> None:
     """Whether weights fit a design.
 
     Raises:
       ValueError: the first layer that does not fit, in one line.
     """
-    wanted = jax.eval_shape(lambda: fresh_weights(design))
-    for layer, values in wanted.items():
+    for layer, values in _shapes(design).items():
         for name, value in values.items():
             found = weights.get(layer, {}).get(name)
             if found is None or found.shape != value.shape:
@@ -325,18 +303,9 @@ def check_weights(path: str, design: Design, weights: Mapping[str, Mapping[str, 
                 raise ValueError(f"{path}: {layer}/{name} is {shape}; this network has {list(value.shape)}")
 
 
-def digest(trained: Trained) -> str:
-    """A hash of a network: results of other weights are other results.
-
-    Weights within a function that is being traced have none.
-    """
-    leaves = jax.tree.leaves(trained.weights)
-    if any(isinstance(x, Tracer) for x in leaves):
-        return ""
-    told = hashlib.sha256(repr(trained.design).encode())
-    for x in leaves:
-        told.update(np.asarray(x, np.float32).tobytes())
-    return told.hexdigest()[:16]
+@functools.lru_cache(maxsize=8)
+def _shapes(design: Design) -> Any:
+    return jax.eval_shape(lambda: fresh_weights(design))
 
 
 def parameters(weights: Any) -> int:

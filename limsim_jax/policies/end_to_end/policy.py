@@ -38,12 +38,12 @@ from limsim_jax.policies.end_to_end.network import (
     Network,
     Outputs,
     Trained,
-    digest,
     load_weights,
     path_places,
     target_speed,
 )
 from limsim_jax.policies.reference import ReferencePath, project_onto
+from limsim_jax.policies.weights import digest
 from limsim_jax.sensors.camera import Pictures
 from limsim_jax.sensors.faults import FaultMemory, Faults
 from limsim_jax.sensors.rig import Rig
@@ -93,6 +93,7 @@ class EndToEnd(Policy):
       faults: of its sensors; a table in a file.
       rig: of its vehicles; None: the one that the network was trained with.
       network: in the place of `weights`, as training has it.
+      trained: the network.
       content: a hash of the network.
 
     Raises:
@@ -105,6 +106,7 @@ class EndToEnd(Policy):
     faults: Faults | Mapping[str, Any] | None = None
     rig: Rig | None = None
     network: Trained | None = field(default=None, repr=False, compare=False)
+    trained: Trained = field(init=False, repr=False, compare=False)
     content: str = field(default="", init=False, repr=False)
     privileged: bool = field(default=True, kw_only=True)
 
@@ -125,16 +127,16 @@ class EndToEnd(Policy):
             if self.faults.delay:
                 raise ValueError(f"faults: delay: {self.faults.delay} s; the driver has none")
         _ = self.sensors
-        object.__setattr__(self, "content", digest(self.trained))
+        trained = self._network()
+        object.__setattr__(self, "trained", trained)
+        object.__setattr__(self, "content", digest(trained.weights, repr(trained.design)))
 
     @property
     def sensors(self) -> Sensors:
         """The sensors of its vehicles."""
         return Sensors() if self.rig is None else Sensors(self.rig)
 
-    @property
-    def trained(self) -> Trained:
-        """The network."""
+    def _network(self) -> Trained:
         if self.network is not None:
             return self.network
         if self.weights is None and not WEIGHTS.exists():

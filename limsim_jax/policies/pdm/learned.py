@@ -8,10 +8,8 @@ pose. `limsim_jax.training` trains it on rollouts.
 
 from __future__ import annotations
 
-import functools
-import io
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +26,7 @@ from limsim_jax.policies.base import Policy
 from limsim_jax.policies.pdm.policy import PDMClosed, Plan
 from limsim_jax.policies.pdm.road import DT, STEPS, bodies, road_ahead
 from limsim_jax.policies.reference import to_cartesian
+from limsim_jax.policies.weights import digest, pack, unpack
 from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.ego import Trajectory
 from limsim_jax.types import Config, State
@@ -200,15 +199,20 @@ class PDMHybrid(Policy):
       weights: file of `save_weights`; None: those that come with the package.
       seen: as in `PDMClosed`.
       strict_tuplan: as in `PDMClosed`.
+      network: what the file held.
+      content: a hash of the network.
     """
 
     weights: str | None = None
     seen: int = 32
     strict_tuplan: bool = False
+    network: dict[str, dict[str, np.ndarray]] = field(init=False, repr=False, compare=False)
+    content: str = field(default="", init=False, repr=False)
 
     def __post_init__(self) -> None:
         PDMClosed(seen=self.seen)
-        load_weights(self.path)
+        object.__setattr__(self, "network", load_weights(self.path))
+        object.__setattr__(self, "content", digest(self.network))
 
     @property
     def closed(self) -> PDMClosed:
@@ -239,9 +243,8 @@ class PDMHybrid(Policy):
         """The command, and the network's poses in the frame of each ego."""
         plan = self.closed.plan(config, lane_map, state, beyond=BEYOND)
         seen = features(config, lane_map, state, past, plan, self.strict_tuplan)
-        weights = load_weights(self.path)
-        hidden = weights["Dense_0"]["bias"].shape[0]
-        poses = Offset(hidden).apply({"params": weights}, seen)
+        hidden = self.network["Dense_0"]["bias"].shape[0]
+        poses = Offset(hidden).apply({"params": self.network}, seen)
         assert isinstance(poses, jax.Array)
 
         # the correction at the poses, 0 until CORRECTED_FROM, linear in between
@@ -278,17 +281,9 @@ class PDMHybrid(Policy):
 
 def save_weights(path: str | Path, weights: Any) -> None:
     """Write the parameters of `Offset` as .npz, in half precision and atomically."""
-    flat = {
-        f"{layer}/{name}": np.asarray(value, np.float16)
-        for layer, values in weights.items()
-        for name, value in values.items()
-    }
-    file = io.BytesIO()
-    np.savez(file, **flat)  # pyright: ignore[reportArgumentType]
-    write_whole(path, file.getvalue())
+    write_whole(path, pack(weights))
 
 
-@functools.lru_cache(maxsize=4)
 def load_weights(path: str) -> dict[str, dict[str, np.ndarray]]:
     """Read what `save_weights` wrote.
 
@@ -296,14 +291,9 @@ def load_weights(path: str) -> dict[str, dict[str, np.ndarray]]:
       ValueError: no such file, or weights of another network.
     """
     try:
-        with np.load(path) as file:
-            flat = {name: np.asarray(file[name], np.float32) for name in file.files}
+        weights, _ = unpack(Path(path).read_bytes())
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: no weights of PDM-Hybrid: {error}") from None
-    weights: dict[str, dict[str, np.ndarray]] = {}
-    for name, value in flat.items():
-        layer, _, part = name.partition("/")
-        weights.setdefault(layer, {})[part] = value
     sizes = (HISTORY * 8, CENTRE_LINE * 3, POSES * 3)
     found = tuple(weights.get(f"Dense_{k}", {}).get("kernel", np.zeros((0, 0))).shape[0] for k in range(3))
     if found != sizes or len(weights) != 6:
