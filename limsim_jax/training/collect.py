@@ -22,11 +22,11 @@ from limsim_jax.maps.scenery import Label
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import lane_states
 from limsim_jax.policies.base import PolicyLike, sighted
-from limsim_jax.policies.end_to_end.control import cell_middles
 from limsim_jax.policies.end_to_end.inputs import LIDAR_RANGE, STEP, Inputs
 from limsim_jax.policies.end_to_end.network import (
     CELL,
     DENSITY,
+    DENSITY_GRID,
     JUNCTION,
     LENGTH,
     SPEED,
@@ -38,7 +38,6 @@ from limsim_jax.policies.end_to_end.network import (
     Network,
     Outputs,
     Trained,
-    density_shape,
     fresh_weights,
     path_places,
 )
@@ -136,14 +135,13 @@ def labels_of(config: Config, lane_map: LaneMap, state: State, seen: Seen, plan:
 
 def _density(seen: Seen) -> Float[Array, "E 16 12 8"]:
     """The density map of the vehicles that the LiDAR meets."""
-    rows, columns = density_shape()
-    middle_x, middle_y = cell_middles()
+    rows, columns = DENSITY_GRID.shape
+    middle_x, middle_y = DENSITY_GRID.middles()
 
     def one(scan: Any, bodies: Any) -> Float[Array, "Q 8"]:
         there = bodies.there & (bodies.slot >= 0) & (hits_per_body(scan, bodies) >= HITS)
-        row = jnp.floor((bodies.x - middle_x[0, 0]) / CELL + 0.5).astype(jnp.int32)
-        column = jnp.floor((bodies.y - middle_y[0, 0]) / CELL + 0.5).astype(jnp.int32)
-        there &= (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        row, column, inside = DENSITY_GRID.cells(bodies.x, bodies.y)
+        there &= inside
         cell = jnp.where(there, row * columns + column, rows * columns)
         x = (bodies.x - middle_x[0, 0]) / CELL - row.astype(jnp.float32)
         y = (bodies.y - middle_y[0, 0]) / CELL - column.astype(jnp.float32)

@@ -22,7 +22,6 @@ from limsim_jax.policies.end_to_end.control import (
     UNBLOCK,
     Way,
     arc_through,
-    cell_middles,
     filtered,
     free_distances,
     objects_of,
@@ -33,12 +32,12 @@ from limsim_jax.policies.end_to_end.control import (
 from limsim_jax.policies.end_to_end.inputs import BANDS, LIDAR_RANGE, RASTER, Sensors, _nearest, _raster
 from limsim_jax.policies.end_to_end.network import (
     CHANGES,
+    DENSITY_GRID,
     Design,
     Network,
     Outputs,
     Trained,
     blank_inputs,
-    density_shape,
     fresh_weights,
     load_weights,
     parameters,
@@ -100,7 +99,7 @@ def test_shapes_of_all_designs(changes):
     design = Design(**changes)
     made = jax.eval_shape(lambda: fresh_weights(design))
     said = jax.eval_shape(lambda w: Network(design).apply({"params": w}, blank_inputs(3)), made)
-    rows, columns = density_shape()
+    rows, columns = DENSITY_GRID.shape
     shapes = [x.shape for x in said]
     assert shapes == [(3, 10), (3, len(CHANGES)), (3, 8, 2), (3, rows, columns, 8), (3, 3)]
     assert ("pictures" in made) == design.cameras and ("window" in made) == design.lidar
@@ -217,10 +216,10 @@ def test_from_beside_the_way_the_vehicle_comes_back():
 
 def density_with(*boxes):
     """A density map with objects x, y, heading, length, width, v."""
-    rows, columns = density_shape()
+    rows, columns = DENSITY_GRID.shape
     density = np.zeros((1, rows, columns, 8), np.float32)
     density[..., 0] = -5
-    middle_x, middle_y = (m.ravel() for m in cell_middles())
+    middle_x, middle_y = (m.ravel() for m in DENSITY_GRID.middles())
     for x, y, heading, length, width, v in boxes:
         row, column = np.argmin(np.abs(middle_x - x)), np.argmin(np.abs(middle_y - y))
         density[0, row, column] = (

@@ -10,11 +10,11 @@ import pytest
 
 from limsim_jax.policies.end_to_end.network import (
     CHANGES,
+    DENSITY_GRID,
     Design,
     Network,
     Outputs,
     blank_inputs,
-    density_shape,
     fresh_weights,
     two_hot,
 )
@@ -27,7 +27,7 @@ DESIGN = Design(cameras=False, hidden=32)
 
 def labels(count: int, change: Any = 0.0, **changes: Any) -> Any:
     """Labels of moments on an empty road."""
-    rows, columns = density_shape()
+    rows, columns = DENSITY_GRID.shape
     plain: Any = dict(
         path=np.zeros((count, 10), np.float32),
         known=np.ones((count, 10), bool),

@@ -15,8 +15,15 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from limsim_jax.geometry import boxes_overlap
-from limsim_jax.policies.end_to_end.inputs import RASTER
-from limsim_jax.policies.end_to_end.network import CELL, DENSITY, LENGTH, SPEED, TARGET_TIME, WIDTH
+from limsim_jax.policies.end_to_end.network import (
+    CELL,
+    DENSITY,
+    DENSITY_GRID,
+    LENGTH,
+    SPEED,
+    TARGET_TIME,
+    WIDTH,
+)
 from limsim_jax.policies.reference import ReferencePath
 from limsim_jax.traffic.ego import Limits
 from limsim_jax.xla import mapped_like
@@ -194,22 +201,11 @@ class Objects(NamedTuple):
     there: Bool[Array, "E K"]
 
 
-def cell_middles() -> tuple[np.ndarray, np.ndarray]:
-    """Middles of the cells of the density map, m.
-
-    Shapes are `[16, 1]` and `[1, 12]`.
-    """
-    rows, columns = (round(n * RASTER.cell / CELL) for n in RASTER.shape)
-    x = (np.arange(rows) + 0.5) * CELL - RASTER.behind
-    y = (np.arange(columns) + 0.5) * CELL - RASTER.side
-    return x[:, None].astype(np.float32), y[None].astype(np.float32)
-
-
 def objects_of(density: Float[Array, "E R S 8"]) -> Objects:
     """The surest objects of a density map."""
     egos, rows, columns, _ = density.shape
     flat = density.reshape(egos, -1, len(DENSITY))
-    x, y = (jnp.asarray(np.broadcast_to(m, (rows, columns)).ravel()) for m in cell_middles())
+    x, y = (jnp.asarray(np.broadcast_to(m, (rows, columns)).ravel()) for m in DENSITY_GRID.middles())
     sure, which = lax.top_k(flat[..., 0], OBJECTS)
     found = jnp.take_along_axis(flat, which[..., None], 1)
     value = {name: found[..., k] for k, name in enumerate(DENSITY)}

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
-from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.reference import ReferencePath, project_onto, reference_path
 from limsim_jax.sensors.camera import Pictures, take_pictures
@@ -301,8 +300,3 @@ def _nearest(
     ahead = jnp.min(jnp.where(within & (along >= 0), along, LIDAR_RANGE), -1)
     behind = jnp.min(jnp.where(within & (along < 0), -along, LIDAR_RANGE), -1)
     return jnp.minimum(jnp.stack([ahead, behind], -1), LIDAR_RANGE)
-
-
-def relative(angle: Array, heading: Array) -> Array:
-    """An angle from a heading, rad within half a turn."""
-    return wrap_angle(angle - heading)

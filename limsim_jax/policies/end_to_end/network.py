@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from limsim_jax.files import write_whole
-from limsim_jax.policies.end_to_end.inputs import BANDS, EGO, LIDAR_RANGE, POINTS, RASTER, STEP, Inputs
+from limsim_jax.policies.end_to_end.inputs import BANDS, EGO, LIDAR_RANGE, POINTS, RASTER, STEP, Grid, Inputs
 from limsim_jax.policies.weights import Layers, pack, unpack
 
 PATH_POINTS = 10
@@ -39,6 +39,9 @@ TARGET_TIME = 1.0
 
 CELL = 4.0
 """Side of a cell of the density map, m: two cells of the raster, at most one car."""
+
+DENSITY_GRID = Grid(cell=CELL)
+"""Cells of the density map."""
 
 DENSITY = ("object", "x", "y", "cosine", "sine", "length", "width", "speed")
 """Numbers of a cell: logit; middle from that of the cell (cells), heading, size (typical cars), speed."""
@@ -89,13 +92,6 @@ class Outputs(NamedTuple):
     waypoints: Float[Array, "*b 8 2"]  # m, in the frame of the vehicle
     density: Float[Array, "*b 16 12 8"]  # numbers of `DENSITY`; rows from behind to ahead
     rules: Float[Array, "*b 3"]  # logits of `RULES`
-
-
-def density_shape() -> tuple[int, int]:
-    """Rows and columns of the density map."""
-    rows, columns = RASTER.shape
-    share = round(CELL / RASTER.cell)
-    return rows // share, columns // share
 
 
 def path_places(v: Float[Array, "*b"]) -> Float[Array, "*b 10"]:
@@ -186,7 +182,7 @@ class Network(nn.Module):
 
     def _density(self, x: Array, window: Array | None) -> Float[Array, "*b 16 12 8"]:
         """The density map: what a window shows, in the light of all."""
-        batch, (rows, columns) = x.shape[:-1], density_shape()
+        batch, (rows, columns) = x.shape[:-1], DENSITY_GRID.shape
         tall, broad = rows // 2, columns // 2
         context = nn.relu(nn.Dense(16, name="context")(x))
         seen = jnp.broadcast_to(context[..., None, :], (*batch, tall * broad, 16))

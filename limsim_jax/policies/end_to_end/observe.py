@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt8
 
+from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.policies.end_to_end.inputs import Sensors, relative, route_of
+from limsim_jax.policies.end_to_end.inputs import Sensors, front_rig, route_of
 from limsim_jax.sensors.rig import Rig
 from limsim_jax.types import Config, State
 
@@ -48,7 +49,7 @@ class ObserveSensors:
       ValueError: a rig without one of both.
     """
 
-    rig: Rig = field(default_factory=lambda: Sensors().rig)
+    rig: Rig = field(default_factory=front_rig)
 
     needs_scenery = True
     knows = "sensors"
@@ -69,7 +70,7 @@ class ObserveSensors:
             lidar=look.scan.range,
             route_x=cos * dx + sin * dy,
             route_y=cos * dy - sin * dx,
-            route_heading=relative(path.heading[:, :ROUTE_POINTS], egos.heading[:, None]),
+            route_heading=wrap_angle(path.heading[:, :ROUTE_POINTS] - egos.heading[:, None]),
             route_limit=path.limit[:, :ROUTE_POINTS],
             v=state.v[slot],
             a=egos.a,
