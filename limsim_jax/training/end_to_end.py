@@ -270,9 +270,11 @@ class Report:
     def __str__(self) -> str:
         about = self.trained.about
         state = "stopped" if self.stopped else "finished"
+        held_out = about["held_out"]
+        loss = "held-out loss unknown" if held_out is None else f"held-out loss {held_out:.3f}"
         return (
             f"{state} after {about['seconds'] / 60:.1f} min: {sum(about['samples'].values()):,} samples, "
-            f"{about['steps']:,} steps, held-out loss {about['held_out']:.3f}"
+            f"{about['steps']:,} steps, {loss}"
         )
 
 

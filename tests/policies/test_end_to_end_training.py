@@ -14,6 +14,7 @@ from limsim_jax.policies.end_to_end.network import (
     Design,
     Network,
     Outputs,
+    Trained,
     blank_inputs,
     fresh_weights,
     two_hot,
@@ -183,3 +184,9 @@ def test_weights_differ_by_seed_only():
     one, same, other = (fresh_weights(DESIGN, seed) for seed in (1, 1, 2))
     assert all(map(np.array_equal, jax.tree.leaves(one), jax.tree.leaves(same)))
     assert not np.array_equal(one["path"]["kernel"], other["path"]["kernel"])
+
+
+def test_a_training_that_is_stopped_at_once_still_says_so():
+    about = {"seconds": 30.0, "samples": {}, "steps": 0, "held_out": None}
+    report = end_to_end.Report(Trained(DESIGN, {}, about), stopped=True)
+    assert str(report) == "stopped after 0.5 min: 0 samples, 0 steps, held-out loss unknown"
