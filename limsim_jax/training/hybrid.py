@@ -167,7 +167,8 @@ def record(
         run = replace(run, policy=_Recorder(run.policy, run.decisions), measure=None)
 
         def one(lane_map: LaneMap, seed: jax.Array, run: Any = run, episodes: Any = episodes) -> _Memory:
-            return run.advance(lane_map, *started(run, lane_map, episodes.sample, seed))[1].memory
+            memory = run.advance(lane_map, *started(run, lane_map, episodes.sample, seed))[1].memory
+            return memory.policy  # the recorder has a view, as PDM-Hybrid does
 
         many = jax.jit(jax.vmap(one, in_axes=(None, 0)))
         for first in range(0, len(seeds), chunk):
