@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Key
 
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.map import Map
+from limsim_jax.maps.scenery import Scenery
 from limsim_jax.policies.predict import Predictor
 from limsim_jax.policies.view import View, view_of
 from limsim_jax.sensors.rig import Rig
@@ -241,6 +242,17 @@ def with_scenery(policy: Any, town: Map, lane_map: LaneMap | None = None) -> Lan
     """
     lanes = town.lanes if lane_map is None else lane_map
     return replace(lanes, scenery=town.scenery) if needs_scenery(policy) else lanes
+
+
+def scenery_of(lane_map: LaneMap) -> Scenery:
+    """The scenery of a map.
+
+    Raises:
+      ValueError: the map comes without.
+    """
+    if lane_map.scenery is None:
+        raise ValueError("lane_map: no scenery; limsim_jax.policies.base.with_scenery adds it")
+    return lane_map.scenery
 
 
 def sensors_of(policy: Any) -> Rig | None:

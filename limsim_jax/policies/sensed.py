@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.policies.base import scenery_of
 from limsim_jax.policies.host import Observe
 from limsim_jax.policies.vector import SPEED
 from limsim_jax.sensors.bev import CHANNELS, Raster, birds_eye
@@ -75,9 +76,7 @@ class ObserveScaled:
         Raises:
           ValueError: the map comes without scenery.
         """
-        scenery = lane_map.scenery
-        if scenery is None:
-            raise ValueError("lane_map: no scenery; limsim_jax.policies.base.with_scenery adds it")
+        scenery = scenery_of(lane_map)
         scene, slot = scene_of(lane_map, scenery, state), state.egos.slot
         ways = Observe(nearest=1, points=_POINTS, step=_STEP)(config, lane_map, state)
         routes = jnp.stack([ways.way_x, ways.way_y], -1)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.policies.base import scenery_of
 from limsim_jax.policies.reference import ReferencePath, project_onto, reference_path
 from limsim_jax.sensors.camera import Pictures, take_pictures
 from limsim_jax.sensors.lidar import Scan, points_of, scan_around
@@ -167,9 +168,7 @@ class Sensors:
         Raises:
           ValueError: the map comes without scenery.
         """
-        if lane_map.scenery is None:
-            raise ValueError("lane_map: no scenery; limsim_jax.policies.base.with_scenery adds it")
-        scenery, lidar = lane_map.scenery, self.rig.lidar
+        scenery, lidar = scenery_of(lane_map), self.rig.lidar
         assert lidar is not None
         scene = scene_of(lane_map, scenery, state)
 

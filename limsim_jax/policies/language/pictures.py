@@ -12,6 +12,7 @@ from jaxtyping import Array, UInt8
 from numpy.typing import NDArray
 
 from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.policies.base import scenery_of
 from limsim_jax.sensors.camera import take_pictures
 from limsim_jax.sensors.rig import Rig, front_cameras, six_cameras
 from limsim_jax.sensors.scene import bodies_around, pose_of, scene_of
@@ -53,9 +54,7 @@ def look(rig: Rig, lane_map: LaneMap, state: State) -> UInt8[Array, "E C H W 3"]
     Raises:
       ValueError: the map comes without scenery.
     """
-    scenery = lane_map.scenery
-    if scenery is None:
-        raise ValueError("lane_map: no scenery; limsim_jax.policies.base.with_scenery adds it")
+    scenery = scenery_of(lane_map)
     scene = scene_of(lane_map, scenery, state)
 
     def one(slot: Array) -> Array:
