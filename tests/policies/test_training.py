@@ -156,7 +156,7 @@ def test_a_file_that_is_trained_again_is_another_policy(tmp_path):
     new = PDMHybrid(weights=file)
     assert old == same != new and describe(old) == describe(same) != describe(new)
     for policy, weights in ((old, first), (new, second)):  # each drives as what it read
-        kernel = weights["Dense_0"]["kernel"]
+        kernel = np.asarray(weights["Dense_0"]["kernel"])
         np.testing.assert_allclose(policy.network["Dense_0"]["kernel"], kernel, rtol=2e-3, atol=1e-4)
 
 
