@@ -77,7 +77,11 @@ def ablations(out: Path, minutes: float) -> dict[str, EndToEnd]:
         file = out / f"{name.replace(' ', '_')}.npz"
         if not file.exists():
             print(f"training '{name}'", flush=True)
-            train(file, design=design, rounds=rounds, minutes=minutes, tell=partial(print, flush=True))
+            part = file.with_suffix(".part.npz")
+            tell = partial(print, flush=True)
+            if train(part, design=design, rounds=rounds, minutes=minutes, tell=tell).stopped:
+                raise SystemExit(f"'{name}' is half trained; its weights are in {part}")
+            part.rename(file)
         found[name] = EndToEnd(str(file))
     return found
 

@@ -56,10 +56,12 @@ def main() -> None:
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--small-model", action="store_true")
     parser.add_argument("--server", help="up to /v1")
-    parser.add_argument("--model")
+    parser.add_argument("--model", default=os.environ.get("LIMSIM_MODEL"))
     parser.add_argument("--style", default="plain")
     parser.add_argument("--out", type=Path, default=RESULTS)
     told = parser.parse_args()
+    if told.server and not told.model:
+        parser.error("--server: which model? --model NAME or $LIMSIM_MODEL")
     use_all_cores()
     names = told.experiments.split(",")
     if told.small_model:
