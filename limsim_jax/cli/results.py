@@ -539,9 +539,11 @@ def reflect(
 
     What it learns goes into a file for the option memory of its next sweep (--odd-seeds)."""
     from limsim_jax.api.results import rebuild
+    from limsim_jax.files import check_writable
     from limsim_jax.sweeps.reflect import reflect as look_back
     from limsim_jax.sweeps.store import open_results
 
+    check_writable(memory)
     opened = open_results(results)
     group = _group(opened, scenario, policy)
     drivers = rebuild(opened, *group).notes.drivers
