@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -33,6 +35,8 @@ CLASSES = {
     "bicycle": "motorcycle",
 }
 """Vehicle classes of the engine by categories of files; all others are cars with bodies of their own."""
+
+_start = jax.jit(start_state)  # operation by operation it takes longer
 
 
 @dataclass(frozen=True)
@@ -77,14 +81,12 @@ def outside_of(board: Board, memory: Memory, slot: Any, box: Any) -> Outside:
 
 def vehicles(entities: tuple[Entity, ...], count: int) -> tuple[Driver, Shape]:
     """Drivers and bodies of entities, `[count]`; padding is a car."""
-    tables = [
-        EgoTable(vehicle=CLASSES.get(x.category, "car") if x.kind == "vehicle" else "car") for x in entities
-    ]
-    tables += [EgoTable()] * (count - len(entities))
-    driver, shape = vehicles_of("entities", tables)
+    names = [CLASSES.get(x.category, "car") if x.kind == "vehicle" else "car" for x in entities]
+    names += ["car"] * (count - len(entities))
+    driver, shape = jax.tree.map(lambda *x: np.concatenate(x), *map(_of_class, names))
 
     def column(values: list[float], old: Any) -> Any:
-        return jnp.asarray([*values, *np.asarray(old)[len(values) :]], jnp.float32)
+        return np.array([*values, *old[len(values) :]], np.float32)
 
     bodies = [x.box for x in entities]
     bases = [x.wheelbase or min(2.7, 0.6 * x.box.length) for x in entities]
@@ -94,6 +96,12 @@ def vehicles(entities: tuple[Entity, ...], count: int) -> tuple[Driver, Shape]:
         wheelbase=column(bases, shape.wheelbase),
         vehicle_class=shape.vehicle_class,
     )
+
+
+@cache
+def _of_class(name: str) -> tuple[Driver, Shape]:
+    """Driver and body of a class of vehicles, `[1]`, NumPy."""
+    return jax.tree.map(np.asarray, vehicles_of("entities", [EgoTable(vehicle=name)]))
 
 
 def world_of(
@@ -119,45 +127,30 @@ def world_of(
     slot[order] = np.arange(count)
     driver, shape = vehicles(tuple(scenario.entities[k] for k in order if k < len(scenario.entities)), slots)
     lane, s, d, v, goal, active = _starts(built, roads, order, slots)
-    lane_map = town.lanes
-    state = start_state(
-        lane_map, driver, shape,
-        lane=jnp.asarray(lane), s=jnp.asarray(s), v=jnp.asarray(v), goal=jnp.asarray(goal),
-        active=jnp.asarray(active),
-    )  # fmt: skip
-    device = built.board, built.memory
-    board, memory = device
-    real = np.asarray(board.entities.real)
-    here = np.where(real, slot, -1).astype(np.int32)
-    outside = outside_of(board, memory, jnp.asarray(here), jnp.zeros((count, 5), jnp.float32))
+    state = _start(town.lanes, driver, shape, lane=lane, s=s, v=v, goal=goal, active=active)
+    board, memory = built.board, built.memory
+    here: Any = np.where(board.entities.real, slot, -1).astype(np.int32)
+    outside = outside_of(board, memory, here, None)
     x, y, h = (np.asarray(z) for z in (outside.x, outside.y, outside.heading))
-    box = jnp.stack([outside.x, outside.y, outside.heading, *(jnp.asarray(z) for z in (
-        board.entities.length, board.entities.width))], -1)  # fmt: skip
-    egos = Egos(
-        slot=jnp.zeros(1, jnp.int32),
-        free=jnp.full(1, free),
-        x=jnp.asarray(x[ego : ego + 1]),
-        y=jnp.asarray(y[ego : ego + 1]),
-        heading=jnp.asarray(h[ego : ego + 1]),
-        steering=jnp.zeros(1, jnp.float32),
-        a=jnp.zeros(1, jnp.float32),
-    )
-    from dataclasses import replace
-
-    state = replace(state, d=jnp.asarray(d), egos=egos, outside=replace(outside, box=box))
+    box: Any = np.stack([x, y, h, board.entities.length, board.entities.width], -1)
+    zero, mine = np.zeros(1, np.float32), slice(ego, ego + 1)
+    egos: dict[str, Any] = dict(
+        slot=np.zeros(1, np.int32), free=np.full(1, free), x=x[mine], y=y[mine], heading=h[mine],
+        steering=zero, a=zero,
+    )  # fmt: skip
+    state = replace(state, d=d, egos=Egos(**egos), outside=replace(outside, box=box))
     return World(start=state, schedule=schedule_of(board, driver, shape))
 
 
 def schedule_of(board: Board, driver: Driver, shape: Shape) -> Schedule:
     """A schedule without vehicles, with the scenario."""
-    import jax
-
-    none = jnp.zeros(1, jnp.float32)
+    none, zero = np.zeros(1, np.float32), np.zeros(1, np.int32)
     first = jax.tree.map(lambda z: z[:1], (driver, shape))
-    return Schedule(
-        time=none + jnp.inf, lane=jnp.zeros(1, jnp.int32), s=none, v=none, goal=jnp.zeros(1, jnp.int32),
-        driver=first[0], shape=first[1], start=jnp.zeros(1, jnp.int32), outside=board,
+    fields: dict[str, Any] = dict(
+        time=none + np.float32(np.inf), lane=zero, s=none, v=none, goal=zero, driver=first[0], shape=first[1],
+        start=zero, outside=board,
     )  # fmt: skip
+    return Schedule(**fields)
 
 
 def _ego_row(scenario: Scenario, built: Built) -> int:
