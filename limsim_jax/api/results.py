@@ -292,8 +292,7 @@ def rebuild(stored: Stored, scenario: str, policy: str, *, cores: int | None = N
     """The worlds of stored results, from what is stored about them.
 
     Raises:
-      ResultsError: they hang on a Python value (a policy, drivers, metrics) that a folder does not hold, or
-        are variants of an OpenSCENARIO file.
+      ResultsError: they hang on a Python value (a policy, drivers, metrics) that a folder does not hold.
     """
     from limsim_jax.policies.language.driver import offline
     from limsim_jax.sweeps.episode import Episodes
@@ -301,11 +300,6 @@ def rebuild(stored: Stored, scenario: str, policy: str, *, cores: int | None = N
     from limsim_jax.xla import use_all_cores
 
     about = stored.provenance[scenario, policy]
-    if "openscenario" in about:
-        raise ResultsError(
-            f"{stored.path}: {scenario} ({policy}) are variants of {about['openscenario_file']}, and a "
-            "folder of results cannot make their worlds again"
-        )
     values = [name for name in ("policy", "model", "metrics") if name in about]
     values += ["drivers"] if isinstance(about.get("drivers"), dict) else []
     if values:
@@ -316,6 +310,11 @@ def rebuild(stored: Stored, scenario: str, policy: str, *, cores: int | None = N
     use_all_cores(cores)
     if "engine" in about:  # a bridge ran them; it lies above this room
         return importlib.import_module("limsim_jax.bridges.sumo.world").rebuild(about)
+    if "openscenario" in about:
+        from limsim_jax.scenarios.openscenario.episodes import rebuild as again
+
+        with offline():
+            return again(about, policy)
     experiment = ExperimentFile.model_validate(about["experiment"] | {"map": about["map_file"]})
     with offline():
         return Episodes(experiment, chunk=about["chunk"])

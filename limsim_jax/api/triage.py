@@ -56,7 +56,7 @@ def triage(
       scenario, policy: names; None: all.
       most: groups whose representative is changed and shown, the largest ones.
       change: look for changes, and write replays beside the page. Results whose worlds a folder cannot make
-        again (values from Python, variants of a .xosc) have groups only.
+        again (values from Python) have groups only.
       page: HTML page to write; None: none.
     """
     findings: list[Finding] = []

@@ -10,7 +10,6 @@ import typer
 from limsim_jax.cli.common import JsonOption, table, write_json
 
 if TYPE_CHECKING:
-    from limsim_jax.policies.base import PolicyLike
     from limsim_jax.sweeps.runner import Progress
 
 RootOption = Annotated[
@@ -74,16 +73,6 @@ def files_of(path: Path) -> list[Path]:
     return varied or files
 
 
-def policy_named(name: str | None) -> PolicyLike | None:
-    """The policy of this name; None and "script": the ego keeps to its script."""
-    from limsim_jax.sweeps.build import policy_of
-    from limsim_jax.sweeps.experiment import EgoTable, ExperimentFile
-
-    if name is None or name == "script":
-        return None
-    return policy_of(ExperimentFile(name="policy", map="-", horizon=1.0, ego=(EgoTable(policy=name),)))
-
-
 def sweep_scenarios(
     path: Path,
     policy: str | None,
@@ -111,10 +100,8 @@ def sweep_scenarios(
     length = HORIZON if horizon is None else horizon
     if not 0 < length < 1e5:
         raise typer.BadParameter(f"{length:g} s; it has to be above 0", param_hint="--horizon")
-    driver = policy_named(policy)
+    driver = None if policy == "script" else policy
     options: dict[str, Any] = {"horizon": length, "chunk": chunk, "controlled": controlled}
-    if policy is not None and policy != "script":
-        options["policy_label"] = policy.replace(":", "-").replace(".", "-")
     made = []
     for file in files_of(path):
         found = openscenario(file, lenient=lenient, root=root)

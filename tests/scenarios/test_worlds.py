@@ -1,16 +1,19 @@
 """Scenarios in the engine: entities beside an ego that a policy drives, and variants in a sweep."""
 
+import json
+
 import numpy as np
 import pytest
 import xosc
 from osc_worlds import play, road
 
-from limsim_jax.api.results import rebuild
+from limsim_jax.api import results as stored
 from limsim_jax.policies.base import LikeTraffic
-from limsim_jax.scenarios.openscenario.episodes import episodes_of
+from limsim_jax.scenarios.openscenario.episodes import episodes_of, rebuild
 from limsim_jax.scenarios.openscenario.scenario import openscenario
 from limsim_jax.scenarios.openscenario.source import OpenScenarioError
 from limsim_jax.sweeps import runner
+from limsim_jax.sweeps.experiment import ExperimentError
 from limsim_jax.sweeps.store import ResultsError, open_results
 
 ACTIVATE = (
@@ -62,8 +65,8 @@ def test_variants_are_worlds_of_a_sweep(tmp_path):
     assert rows["parameter_gap"] == [8, 40, 500]
     assert rows["scenario_ended"] == [1, 1, 1]
     assert rows["passed"][1:] == [1, 1]
-    with pytest.raises(ResultsError, match=r"are variants of .*cuts\.xosc, and a folder of results cannot"):
-        rebuild(results, *next(iter(results.provenance)))
+    with pytest.raises(ResultsError, match="was made with policy from Python"):
+        stored.rebuild(results, *next(iter(results.provenance)))
 
     # B is where it is without traffic, and the ego is held until its controller is active
     trace = episodes.worlds.replay(episodes.worlds.start([1])).trace
@@ -76,6 +79,22 @@ def test_variants_are_worlds_of_a_sweep(tmp_path):
     v = np.asarray(trace.v)[0, :, 0]
     np.testing.assert_allclose(v[:19], 20, atol=1e-4)
     assert v[120] < 15  # it brakes for B, which is slower
+
+
+@pytest.mark.parametrize(("policy", "name"), [(None, "script"), ("pdm_closed", "pdm_closed")])
+def test_worlds_are_made_again_from_their_provenance(tmp_path, policy, name):
+    path = cut_in(tmp_path)[1]
+    path = path.rename(tmp_path / f"{'cuts 1.' * 12}xosc")  # too long for a name, which has no points
+    (made,) = episodes_of(openscenario(path), policy, variants=2, horizon=10.0, dt=0.05, chunk=2)
+    assert made.policy == name
+    assert len(made.scenario) == 60
+    assert made.which == [0, 2]
+    about = json.loads(json.dumps(made.provenance()))
+    again = rebuild(about, made.policy)
+    assert (again.scenario, again.policy, again.which) == (made.scenario, name, [0, 2])
+    assert json.loads(json.dumps(again.provenance())) == about
+    with pytest.raises(ExperimentError, match="has variants, no random numbers"):
+        _ = again.layout
 
 
 def test_maps_are_found(tmp_path):

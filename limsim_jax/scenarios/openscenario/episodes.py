@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,22 +17,25 @@ from limsim_jax.maps.map import Map, load_map
 from limsim_jax.maps.network import MapError
 from limsim_jax.maps.xml import file_hash
 from limsim_jax.metrics.observer import EvaluateEgo
+from limsim_jax.metrics.reductions import on_host
 from limsim_jax.policies.base import PolicyLike, policy_name
 from limsim_jax.scenarios.openscenario.build import Built, build
 from limsim_jax.scenarios.openscenario.expressions import Value
 from limsim_jax.scenarios.openscenario.padding import Sizes
 from limsim_jax.scenarios.openscenario.roads import Roads
-from limsim_jax.scenarios.openscenario.scenario import OpenScenario
+from limsim_jax.scenarios.openscenario.scenario import OpenScenario, openscenario
 from limsim_jax.scenarios.openscenario.source import OpenScenarioError, one_line
 from limsim_jax.scenarios.openscenario.storyboard import Scenario
 from limsim_jax.scenarios.openscenario.world import Play, world_of
 from limsim_jax.simulation.rollout import Result, Rollout
 from limsim_jax.simulation.trace import trace
 from limsim_jax.simulation.worlds import Worlds
-from limsim_jax.sweeps.episode import Episodes, digests, provenance_of
-from limsim_jax.sweeps.experiment import EgoTable, ExperimentFile
-from limsim_jax.sweeps.moments import key_moments
-from limsim_jax.sweeps.store import Outcome
+from limsim_jax.sweeps.answers import Notes
+from limsim_jax.sweeps.build import policy_of
+from limsim_jax.sweeps.episode import Episodes, provenance_of
+from limsim_jax.sweeps.experiment import EgoTable, ExperimentFile, name_of
+from limsim_jax.sweeps.reruns import CanBrake
+from limsim_jax.traffic.demand.draws import Layout
 from limsim_jax.traffic.engine import Traffic
 from limsim_jax.types import Config
 from limsim_jax.types import Scenario as World
@@ -43,6 +47,7 @@ PASSED, ENDED = "passed", "scenario_ended"
 _LOOKED_AT = 64
 """Variants whose sizes are looked at before the program is compiled."""
 _CHUNK = 50
+_LONGEST = 60  # letters of a name
 _SCRIPT = "script"
 
 UNITS = {
@@ -87,7 +92,7 @@ class ScenarioEpisodes(Episodes):
     Args:
       scenario: the file.
       which: numbers of variants, all on the same map; world `k` is the `k`-th of them.
-      policy: drives the ego; None: it keeps to its script.
+      policy: drives the ego, or the name of one that does; None: it keeps to its script.
       name: of the scenario in results.
       town: the map.
       chunk: worlds per call.
@@ -95,13 +100,14 @@ class ScenarioEpisodes(Episodes):
       dt: s, physics step.
       decision_every: physics steps per decision.
       controlled: the policy drives from the start, even if the scenario activates it later or never.
+      asked: how many variants of the file, on all maps; None: all.
     """
 
     def __init__(
         self,
         scenario: OpenScenario,
         which: Sequence[int],
-        policy: PolicyLike | None,
+        policy: PolicyLike | str | None,
         *,
         name: str,
         town: Map,
@@ -110,35 +116,34 @@ class ScenarioEpisodes(Episodes):
         dt: float = 0.1,
         decision_every: int = 5,
         controlled: bool = False,
-        policy_label: str | None = None,
+        asked: int | None = None,
     ) -> None:
-        from limsim_jax.policies.base import LikeTraffic
-
         self.source, self.which, self.town = scenario, list(which), town
-        self.scenario = name
-        self.policy = policy_label or (_SCRIPT if policy is None else policy_name(policy))
-        self.roads = Roads(town)
-        self._script_only, self._controlled = policy is None, controlled
-        self._policy: PolicyLike = LikeTraffic() if policy is None else policy
-        self._values = {"policy": policy, "drivers": None, "model": None, "metrics": ()}
+        self.scenario, self._asked = name, asked
+        named = isinstance(policy, str)
         self.experiment = ExperimentFile(
             name=name, map=town.source, horizon=horizon, dt=dt, decision_every=decision_every, slots=64,
-            ego=(EgoTable(policy="like_traffic"),),
+            ego=(EgoTable(policy=policy if named else "like_traffic"),),
         )  # fmt: skip
+        value = None if named else policy
+        self._values = {"policy": value, "drivers": None, "model": None, "metrics": ()}
+        self._policy: PolicyLike = policy_of(self.experiment) if value is None else value
+        self.policy = _SCRIPT if policy is None else self.experiment.policy if named else policy_name(policy)
+        self._script_only, self._controlled = policy is None, controlled
+        self.roads = Roads(town)
         self._measure = EvaluateEgo()
+        self.notes = Notes(self._policy, dt)
         self._script = self._sumo = None
         self._code = None
         self.sizes = self._sizes(dt)
         self.units = self._all_units()
         config = Config(dt=dt, decision_every=decision_every)
-        self.rollout = Rollout(
-            config, Traffic(player=Play()), horizon, self._policy, record=trace, measure=self._measure
-        )
-        self.chunk = min(_CHUNK, max(len(self.which), 1)) if chunk is None else chunk
+        self.rollout = Rollout(config, Traffic(player=Play()), horizon, self._policy, measure=self._measure)
         self.world_bytes = 0
         self.worlds = Worlds(
-            self.rollout, self.lane_map, lambda world: world, chunk=self.chunk,
-            given=lambda seeds: (self.worlds_of(seeds.tolist()), seeds),
+            replace(self.rollout, record=trace, policy=CanBrake(self._policy)),
+            self.lane_map, lambda world: world, given=lambda seeds: (self.worlds_of(seeds.tolist()), seeds),
+            chunk=min(_CHUNK, max(len(self.which), 1)) if chunk is None else chunk,
         )  # fmt: skip
         self.chunk = self.worlds.chunk
 
@@ -147,18 +152,34 @@ class ScenarioEpisodes(Episodes):
         """Vehicles under test."""
         return 1
 
+    @property
+    def layout(self) -> Layout:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """There is none: a scenario has variants.
+
+        Raises:
+          ExperimentError: always.
+        """
+        self._refuse("layout", "a .xosc has variants, no random numbers")
+
+    def under(self, policy: PolicyLike) -> ScenarioEpisodes:
+        """The same worlds under another policy."""
+        run = self.experiment
+        return ScenarioEpisodes(
+            self.source, self.which, policy, name=self.scenario, town=self.town, chunk=self.chunk,
+            horizon=run.horizon, dt=run.dt, decision_every=run.decision_every, controlled=self._controlled,
+            asked=self._asked,
+        )  # fmt: skip
+
     def _sizes(self, dt: float) -> Sizes:
         """Sizes that hold a sample of the variants."""
         count = len(self.which)
         some = np.unique(np.linspace(0, count - 1, min(count, _LOOKED_AT)).astype(int))
         found = Sizes()
         for k in some:
-            found = found | self.built(int(k), dt, found).sizes
+            found = found | self._built(self.source.scenario(self.which[k]), dt, found).sizes
         return found
 
-    def built(self, k: int, dt: float, sizes: Sizes) -> Built:
-        """The arrays of world `k`."""
-        scenario = self.source.scenario(self.which[k])
+    def _built(self, scenario: Scenario, dt: float, sizes: Sizes) -> Built:
         return build(
             scenario, self.roads, dt, script=self._script_only, controlled=self._controlled, sizes=sizes
         )
@@ -168,12 +189,12 @@ class ScenarioEpisodes(Episodes):
         found: dict[int, World] = {}
         for k in dict.fromkeys(seeds):
             k = k % len(self.which)
-            built = self.built(k, self.experiment.dt, self.sizes)
+            scenario = self.source.scenario(self.which[k])
+            built = self._built(scenario, self.experiment.dt, self.sizes)
             if built.sizes != self.sizes:
                 raise OpenScenarioError(
                     f"{self.source.path}: variant {self.which[k]} is larger than others; sweep it alone"
                 )
-            scenario = self.source.scenario(self.which[k])
             found[k] = world_of(scenario, built, self.roads, free=self._policy.free)
         rows = [found[k % len(self.which)] for k in seeds]
         return jax.tree.map(lambda *x: jnp.asarray(np.stack([np.asarray(z) for z in x])), *rows)
@@ -208,8 +229,6 @@ class ScenarioEpisodes(Episodes):
     def _columns(
         self, result: Result, seeds: Sequence[int], answers: Mapping[int, Sequence[Any]]
     ) -> dict[str, NDArray[np.float64]]:
-        from limsim_jax.metrics.reductions import on_host
-
         found: dict[str, NDArray[np.float64]] = dict(on_host(result.measures))
         outside = result.state.outside
         assert outside is not None
@@ -218,29 +237,16 @@ class ScenarioEpisodes(Episodes):
             np.nan_to_num(found[x]) > 0 for x in ("contacts", "off_road", "policy_failed") if x in found
         )
         found[PASSED] = (np.asarray(bad) == 0).astype(float)
-        return found
-
-    def run(self, seeds: Sequence[int]) -> Outcome:
-        """Run at most `chunk` worlds."""
-        (_, result), *_ = self.worlds.chunks(seeds)
-        metrics = self._columns(result, seeds, {})
-        metrics |= self._parameter_columns(seeds)
-        metrics = {name: metrics[name] for name in self.units}
-        rows, egos = np.asarray(seeds, np.int64), np.zeros(len(seeds), np.int32)
-        return Outcome(
-            seeds=rows,
-            egos=egos,
-            metrics=metrics,
-            moments=key_moments(rows, egos, metrics, {}),
-            digest=digests(metrics, result.state, 1),
-        )
+        found |= self._parameter_columns(seeds)
+        return {name: found[name] for name in self.units}
 
     def _parameter_columns(self, seeds: Sequence[int]) -> dict[str, NDArray[np.float64]]:
         found = {}
         for name, values in self.parameters.items():
             words = self.words.get(name)
-            numbers = [_as_number(x) if words is None else float(words.index(str(x))) for x in values]
-            found[f"parameter_{name}"] = np.array([numbers[k] for k in seeds], float)
+            given = [values[k] for k in seeds]
+            numbers = [_as_number(x) if words is None else words.index(str(x)) for x in given]
+            found[f"parameter_{name}"] = np.array(numbers, float)
         return found
 
     def provenance(self) -> dict[str, Any]:
@@ -251,6 +257,9 @@ class ScenarioEpisodes(Episodes):
         return about | {
             "openscenario": {name: file_hash(path.read_bytes()) for name, path in files.items()},
             "openscenario_file": str(self.source.path.absolute()),
+            "lenient": self.source.lenient,
+            "root": None if self.source.root is None else str(self.source.root.absolute()),
+            "asked": self._asked,
             "variants": len(self.which),
             "words": self.words,
             "controlled": self._controlled,
@@ -266,7 +275,7 @@ def _as_number(value: Value) -> float | None:
 
 def episodes_of(
     scenario: OpenScenario,
-    policy: PolicyLike | None,
+    policy: PolicyLike | str | None,
     *,
     override: str | Path | None = None,
     variants: int | None = None,
@@ -276,11 +285,45 @@ def episodes_of(
 
     Args:
       scenario: the file.
-      policy: drives the ego; None: its script.
+      policy: drives the ego, or the name of one that does; None: its script.
       override: as `map_of`.
       variants: so many of them, evenly spread; None: all.
       options: of `ScenarioEpisodes`.
     """
+    return [
+        ScenarioEpisodes(
+            scenario, which, policy, name=name, town=map_of(scenario.scenario(which[0]), override),
+            asked=variants, **options,
+        )
+        for name, which in _by_map(scenario, variants)
+    ]  # fmt: skip
+
+
+def rebuild(about: Mapping[str, Any], policy: str) -> ScenarioEpisodes:
+    """The worlds of stored results, from their provenance.
+
+    Args:
+      about: their provenance.
+      policy: its name in the results.
+
+    Raises:
+      OpenScenarioError: the file or its map is not there any more, or is another one; one line.
+    """
+    scenario = openscenario(about["openscenario_file"], lenient=about["lenient"], root=about["root"])
+    run = ExperimentFile.model_validate(about["experiment"] | {"map": about["map_file"]})
+    which = dict(_by_map(scenario, about["asked"])).get(run.name)
+    if which is None:
+        raise OpenScenarioError(f"{scenario.path}: has no variants of '{run.name}' any more")
+    return ScenarioEpisodes(
+        scenario, which, None if policy == _SCRIPT else run.ego[0].policy, name=run.name,
+        town=map_of(scenario.scenario(which[0]), run.map), chunk=about["chunk"],
+        horizon=run.horizon, dt=run.dt, decision_every=run.decision_every,
+        controlled=about["controlled"], asked=about["asked"],
+    )  # fmt: skip
+
+
+def _by_map(scenario: OpenScenario, variants: int | None) -> list[tuple[str, list[int]]]:
+    """Names and variants of the episodes of a file, one for each of its maps."""
     total = len(scenario)
     chosen = range(total) if variants is None or variants >= total else _spread(total, variants)
     declared = {x.name for x in scenario.template.declarations}
@@ -295,14 +338,17 @@ def episodes_of(
         if key not in groups:
             groups[key] = scenario.scenario(k).map_file if key else named
         by_map.setdefault(groups[key], []).append(k)
-    found = []
-    for file, which in by_map.items():
-        town = map_of(scenario.scenario(which[0]), override)
-        ending = f"-{Path(file).stem}" if len(by_map) > 1 else ""
-        found.append(
-            ScenarioEpisodes(scenario, which, policy, name=f"{scenario.name}{ending}", town=town, **options)
-        )
-    return found
+    endings = [f"-{Path(file).stem}" if len(by_map) > 1 else "" for file in by_map]
+    names = [_short(name_of(Path(f"{scenario.name}{ending}.xosc"))) for ending in endings]
+    return list(zip(names, by_map.values(), strict=True))
+
+
+def _short(name: str) -> str:
+    """The name, or its begin with a hash of all of it if it is too long for an experiment."""
+    if len(name) <= _LONGEST:
+        return name
+    ending = file_hash(name.encode())[:8]
+    return f"{name[: _LONGEST - len(ending) - 1]}_{ending}"
 
 
 def _spread(total: int, count: int) -> list[int]:

@@ -171,12 +171,14 @@ class OpenScenario:
     Attributes:
       path: of the file.
       name: of the file, without its ending.
+      lenient, root: as it was read.
       template: the scenario before its parameters have values.
       variants: values of parameters, variant by variant.
     """
 
     def __init__(self, path: str | Path, *, lenient: bool = False, root: str | Path | None = None) -> None:
-        self.path, within = Path(path), None if root is None else Path(root)
+        self.path, self.lenient = Path(path), lenient
+        self.root = None if root is None else Path(root)
         self.name = self.path.stem
         source = Source(self.path, lenient=lenient)
         top = source.root()
@@ -185,7 +187,7 @@ class OpenScenario:
             raise top.error("a catalog is no scenario; name the scenario that uses it")
         distribution = top.optional("ParameterValueDistribution")
         if distribution is None:
-            self.template = Template(self.path, lenient=lenient, root=within, source=source)
+            self.template = Template(self.path, lenient=lenient, root=self.root, source=source)
             self.variants: Variants = One()
             self._notes: tuple[str, ...] = ()
             return
@@ -194,7 +196,7 @@ class OpenScenario:
         text = named.replace("\\", "/")
         if PurePosixPath(text).is_absolute() or ":" in text or "\0" in text:
             raise distribution.error(f"ScenarioFile '{named}' is absolute; a path from this file is expected")
-        self.template = Template(self.path.parent / text, lenient=lenient, root=within)
+        self.template = Template(self.path.parent / text, lenient=lenient, root=self.root)
         self.variants = read_distributions(distribution, self.template.declarations)
         source.check(top)
         self._notes = tuple(source.notes)
