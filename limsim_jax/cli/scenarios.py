@@ -96,7 +96,9 @@ def sweep_scenarios(
     from limsim_jax.scenarios.openscenario.episodes import HORIZON, episodes_of
     from limsim_jax.scenarios.openscenario.scenario import openscenario
     from limsim_jax.sweeps import runner
+    from limsim_jax.xla import use_all_cores
 
+    use_all_cores()
     length = HORIZON if horizon is None else horizon
     if not 0 < length < 1e5:
         raise typer.BadParameter(f"{length:g} s; it has to be above 0", param_hint="--horizon")

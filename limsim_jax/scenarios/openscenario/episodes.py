@@ -323,7 +323,7 @@ def rebuild(about: Mapping[str, Any], policy: str) -> ScenarioEpisodes:
 
 
 def _by_map(scenario: OpenScenario, variants: int | None) -> list[tuple[str, list[int]]]:
-    """Names and variants of the episodes of a file, one for each of its maps."""
+    """Names and variants of episodes, for each map of a file."""
     total = len(scenario)
     chosen = range(total) if variants is None or variants >= total else _spread(total, variants)
     declared = {x.name for x in scenario.template.declarations}
@@ -344,7 +344,7 @@ def _by_map(scenario: OpenScenario, variants: int | None) -> list[tuple[str, lis
 
 
 def _short(name: str) -> str:
-    """The name, or its begin with a hash of all of it if it is too long for an experiment."""
+    """The name; of one that is too long its begin and a hash."""
     if len(name) <= _LONGEST:
         return name
     ending = file_hash(name.encode())[:8]
