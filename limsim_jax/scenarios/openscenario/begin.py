@@ -50,7 +50,6 @@ def last_of(actions: ActionRows, which: Bool[Array, " A"], count: int) -> Int[Ar
 
 
 def begin(
-    dt: float,
     board: Board,
     memory: Memory,
     geometry: Geometry,
@@ -61,7 +60,6 @@ def begin(
     """The memory after actions have begun or were stopped.
 
     Args:
-      dt: s.
       board: the scenario.
       memory: of the storyboard of this step.
       geometry: how entities lie to each other.
@@ -69,7 +67,6 @@ def begin(
       begins: rows that begin.
       stops: rows that are stopped.
     """
-    del dt
     actions = board.actions
     count = memory.v.shape[0]
     # an action that begins ends what ruled the same motion of its entity

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -12,14 +13,12 @@ import numpy as np
 
 from limsim_jax.scenarios.openscenario.arrays import (
     ActionRows,
-    Along,
     Board,
     Conditions,
     Dimension,
     Edge,
     Elements,
     Entities,
-    Frame,
     Kind,
     Level,
     Memory,
@@ -29,7 +28,7 @@ from limsim_jax.scenarios.openscenario.arrays import (
     Priority,
     Shape,
 )
-from limsim_jax.scenarios.openscenario.build_conditions import condition_row
+from limsim_jax.scenarios.openscenario.build_conditions import BODIES, condition_row
 from limsim_jax.scenarios.openscenario.expressions import Value
 from limsim_jax.scenarios.openscenario.padding import (
     NO_ELEMENT,
@@ -54,9 +53,20 @@ from limsim_jax.scenarios.openscenario.places import (
     row_of,
     ways,
 )
-from limsim_jax.scenarios.openscenario.roads import SIDE, Corridor, PlaceError, Pose, Roads, Spot, foot
+from limsim_jax.scenarios.openscenario.roads import (
+    ACROSS,
+    SIDE,
+    SPACING,
+    Corridor,
+    PlaceError,
+    Pose,
+    Roads,
+    Spot,
+    foot,
+)
 from limsim_jax.scenarios.openscenario.source import OpenScenarioError, one_line
 from limsim_jax.scenarios.openscenario.storyboard import (
+    ELEMENTS,
     Act,
     Action,
     ControllerAction,
@@ -94,9 +104,6 @@ SHAPES = {"step": Shape.STEP, "linear": Shape.LINEAR, "sinusoidal": Shape.SINUSO
 DIMENSIONS = {"time": Dimension.TIME, "rate": Dimension.RATE, "distance": Dimension.DISTANCE}
 EDGES = {"none": Edge.NONE, "rising": Edge.RISING, "falling": Edge.FALLING, "risingOrFalling": Edge.BOTH}
 PRIORITIES = {"parallel": Priority.PARALLEL, "override": Priority.OVERRIDE, "skip": Priority.SKIP}
-FRAMES = {"world": Frame.WORLD, "entity": Frame.ENTITY}  # all others: the road
-DIRECTIONS = {"longitudinal": Along.LONGITUDINAL, "lateral": Along.LATERAL}  # all others: Euclidean
-KINDS = {"vehicle": 0, "pedestrian": 1, "miscellaneous": 2}
 AT_START = "start"  # name of the story that holds actions of the start that take time
 
 MOST_RING = 4096
@@ -203,7 +210,10 @@ class Builder:
             elif isinstance(does, ControllerAction):
                 self.active[name] = does.active or self.controlled
             elif isinstance(does, ValueAction):
-                self.values[does.name] = changed(self.values[does.name], does)
+                try:
+                    self.values[does.name] = changed(self.values[does.name], does)
+                except ValueError:
+                    raise self.error(f"'{does.name}' is a text, which cannot be changed by a number") from None
             else:
                 later.append((name, does))
         return later
@@ -283,7 +293,7 @@ class Builder:
         s, t = project(corridor, placed.pose)
         base = point(corridor, s, 0.0)
         row = row_of(corridor, s)
-        if not corridor.start <= s <= corridor.start + 4.0 * (len(corridor.x) - 1):
+        if not corridor.start <= s <= corridor.start + SPACING * (len(corridor.x) - 1):
             return False
         on = np.abs(corridor.center[row] - t) <= corridor.half[row] + 0.5
         same = corridor.number[row][on & (corridor.half[row] > 0)] == placed.spot.lane.number
@@ -291,12 +301,12 @@ class Builder:
         return (
             bool(same.any())
             and placed.spot.lane.road in roads
-            and math.cos(base.h - placed.pose.h) > math.cos(math.radians(40))
+            and math.cos(base.h - placed.pose.h) > math.cos(ACROSS)
         )
 
     def place_row(self, position: Position, *, drive: bool = False) -> int:
         """The row of a place; `drive`: an entity may go on from there, so that it needs a corridor."""
-        row: dict[str, Any] = {"corridor": -1, "entity": -1, "along": 0.0, "beside": 0.0, "lanes": 0}
+        row = dict(NO_PLACE)
         if isinstance(position, RELATIVE):
             row["entity"] = self.index(position.entity)
             facing = position.orientation
@@ -320,8 +330,8 @@ class Builder:
         return len(self.tables.places) - 1
 
     def _local(self, pose: Pose) -> tuple[float, float, float]:
-        x0, y0 = np.asarray(self.roads.town.lanes.origin, np.float64)
-        return pose.x - float(x0), pose.y - float(y0), pose.h
+        x0, y0 = self._origin
+        return pose.x - x0, pose.y - y0, pose.h
 
     def route_row(self, name: str, route: Route) -> int:
         """The row of the corridor along a route."""
@@ -375,14 +385,11 @@ class Builder:
                 self._act(act, top, story.name, pending)
         for trigger, owner in pending:
             self._trigger(trigger, owner)
-        stop = self._trigger(board.stop, -1) if board.stop else -1
-        return stop
+        return self._trigger(board.stop, -1) if board.stop else -1
 
     def _element(self, level: Level, parent: int, name: str, **fields: Any) -> int:
-        row = {"level": level, "parent": parent, "start": -1, "stop": -1, "most": 1, "priority": 0} | fields
-        self.tables.elements.append(row)
-        kinds = ("story", "act", "maneuverGroup", "maneuver", "event", "action")
-        self.tables.names.append((kinds[level], name))
+        self.tables.elements.append(NO_ELEMENT | {"level": level, "parent": parent} | fields)
+        self.tables.names.append((ELEMENTS[level], name))
         return len(self.tables.elements) - 1
 
     def _later(self, trigger: Trigger | None, owner: int, pending: list[tuple[Trigger, int]]) -> int:
@@ -509,7 +516,7 @@ class Builder:
                     row["place"] = self.place_row(does.route.waypoints[-1])
                 return row
             case SynchronizeAction():
-                row = {
+                return {
                     "kind": Kind.SYNCHRONIZE,
                     "other": self.index(does.master),
                     "place": self.place_row(does.target),
@@ -520,7 +527,6 @@ class Builder:
                     "continuous": does.relative is not None,
                     "value": 0.0 if does.speed is None else does.speed,
                 }
-                return row
             case ControllerAction():
                 return {"kind": Kind.CONTROL, "value": float(does.active)}
             case VisibilityAction():
@@ -593,14 +599,14 @@ class Builder:
         later = self.start()
         for name in self.names:
             if name not in self.placer.at:  # not there at the start
-                self.placer.put(name, Placed(Pose(*self._somewhere()), None))
+                self.placer.put(name, Placed(Pose(*self._origin, 0.0), None))
         rows = [self.corridor_of(self.placer.at[name]) for name in self.names]
         stop = self.storyboard(later)
         t = self.tables
         sizes = self._sizes() | least
         entities = self._entities(sizes)
         tables: dict[str, Any] = dict(
-            corridors=corridors_rows(t.corridors, self._origin(), sizes),
+            corridors=corridors_rows(t.corridors, self._origin, sizes),
             entities=entities,
             places=columns(Places, t.places, NO_PLACE, sizes.places),
             trajectories=trajectories_rows(t.paths, sizes),
@@ -639,13 +645,10 @@ class Builder:
             delays=[x["delay"] for x in t.conditions],
         )
 
+    @cached_property
     def _origin(self) -> tuple[float, float]:
         x0, y0 = np.asarray(self.roads.town.lanes.origin, np.float64)
         return float(x0), float(y0)
-
-    def _somewhere(self) -> tuple[float, float, float]:
-        x0, y0 = self._origin()
-        return x0, y0, 0.0
 
     def _entities(self, sizes: Sizes) -> Entities:
         count = sizes.entities
@@ -658,7 +661,7 @@ class Builder:
             length=column([x.box.length for x in bodies], 1.0),
             width=column([x.box.width for x in bodies], 1.0),
             ahead=column([x.box.x for x in bodies], 0.0),
-            kind=column([KINDS[x.kind] for x in bodies], 0, np.int32),
+            kind=column([BODIES[x.kind] for x in bodies], 0, np.int32),
             policy=column([x.name == self.ego for x in bodies], False, bool),
             real=column([True] * len(bodies), False, bool),
         )

@@ -33,7 +33,8 @@ _CHANGES = {
 }
 _FRAMES = {"world": Frame.WORLD, "entity": Frame.ENTITY}
 _ALONG = {"longitudinal": Along.LONGITUDINAL, "lateral": Along.LATERAL}
-_KINDS = {"vehicle": 0, "pedestrian": 1, "miscellaneous": 2, "external": 3}
+BODIES = {"vehicle": 0, "pedestrian": 1, "miscellaneous": 2, "external": 3}
+"""Numbers of kinds of entities."""
 
 
 def condition_row(builder: Builder, condition: sb.Condition) -> dict[str, Any]:
@@ -97,7 +98,7 @@ def condition_row(builder: Builder, condition: sb.Condition) -> dict[str, Any]:
             if test.entity is not None:
                 row["entity"] = builder.index(test.entity)
             elif test.kind is not None:
-                row["kind"] = _KINDS[test.kind]
+                row["kind"] = BODIES[test.kind]
         case sb.Angle():
             row |= {"test": Test.ANGLE, "value": test.angle, "tolerance": test.tolerance}
             row["entity"] = builder.index(test.entity)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from limsim_jax.scenarios.openscenario.arrays import LATERAL, Board, Kind, Memory
+from limsim_jax.scenarios.openscenario.arrays import Board, Memory
 from limsim_jax.scenarios.openscenario.begin import begin
 from limsim_jax.scenarios.openscenario.conditions import STANDING, look, raw
 from limsim_jax.scenarios.openscenario.lookups import (
@@ -27,7 +27,7 @@ from limsim_jax.scenarios.openscenario.lookups import (
 from limsim_jax.scenarios.openscenario.motion import move
 from limsim_jax.scenarios.openscenario.storyline import advance, complete
 
-__all__ = ["LATERAL", "Bodies", "Kind", "step"]
+__all__ = ["Bodies", "step"]
 
 
 class Bodies(NamedTuple):
@@ -58,7 +58,7 @@ def step(dt: float, board: Board, memory: Memory, bodies: Bodies | None = None) 
     geometry = look(board, memory)
     truth, each = raw(board, memory, geometry, time)
     started = advance(board, memory, truth, each)
-    memory = begin(dt, board, started.memory, geometry, time, started.begins, started.stops)
+    memory = begin(board, started.memory, geometry, time, started.begins, started.stops)
     memory = move(dt, board, memory, geometry, time)
     return replace(memory, step=memory.step + 1)
 

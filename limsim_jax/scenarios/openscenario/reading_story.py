@@ -10,6 +10,7 @@ from limsim_jax.scenarios.openscenario.reading import Reader
 from limsim_jax.scenarios.openscenario.reading_actions import ActionReader
 from limsim_jax.scenarios.openscenario.source import Node
 from limsim_jax.scenarios.openscenario.storyboard import (
+    ELEMENTS,
     Acceleration,
     Act,
     Action,
@@ -46,7 +47,6 @@ STATES = (
     "standbyState", "runningState", "completeState", "startTransition", "endTransition", "stopTransition",
     "skipTransition",
 )  # fmt: skip
-KINDS = ("story", "act", "maneuverGroup", "maneuver", "event", "action")
 _DIRECTIONS = ("longitudinal", "lateral", "euclidianDistance", "cartesianDistance")
 _SYSTEMS = ("entity", "lane", "road", "trajectory", "world")
 _PRIORITIES = {"overwrite": "override", "override": "override", "parallel": "parallel", "skip": "skip"}
@@ -188,7 +188,7 @@ class StoryReader:
             return SimulationTime(rule=one.choice("rule", RULES), value=one.number("value"))
         if one.tag == "StoryboardElementStateCondition":
             return ElementState(
-                kind=one.choice("storyboardElementType", KINDS),
+                kind=one.choice("storyboardElementType", ELEMENTS),
                 element=one.label("storyboardElementRef"),
                 state=one.choice("state", STATES),
             )

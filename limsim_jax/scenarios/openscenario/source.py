@@ -150,9 +150,7 @@ class Node:
     def skip(self, reason: str) -> None:
         """Leave out this element, and list it."""
         self.source.note(f"<{self.tag}>: {reason}")
-        self.source._seen.update(self.element.iter())
-        for element in self.element.iter():
-            self.source._asked.setdefault(element, set()).update(element.attrib)
+        self.pass_over()
 
     def pass_over(self) -> None:
         """Leave out this element, which changes nothing; no line is written."""

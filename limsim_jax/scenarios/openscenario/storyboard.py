@@ -575,6 +575,10 @@ Trigger = tuple[tuple[Condition, ...], ...]
 # --- the storyboard
 
 
+ELEMENTS = ("story", "act", "maneuverGroup", "maneuver", "event", "action")
+"""Kinds of its parts, from the top down, by the names of files."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Event:
     """Actions that start together; `start` is None where they start with their maneuver."""
