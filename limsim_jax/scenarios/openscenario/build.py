@@ -213,7 +213,9 @@ class Builder:
                 try:
                     self.values[does.name] = changed(self.values[does.name], does)
                 except ValueError:
-                    raise self.error(f"'{does.name}' is a text, which cannot be changed by a number") from None
+                    raise self.error(
+                        f"'{does.name}' is a text, which cannot be changed by a number"
+                    ) from None
             else:
                 later.append((name, does))
         return later
