@@ -72,9 +72,9 @@ Vehicle | yes | | {_READER}::test_entities
 Pedestrian | yes | | {_READER}::test_entities
 MiscObject | yes | | {_READER}::test_entities
 BoundingBox | partly | boxes without heights | {_READER}::test_entities
-Center | partly | x and y | {_READER}::test_entities
+Center | partly | x | {_READER}::test_entities
 Dimensions | partly | length and width | {_READER}::test_entities
-Performance | partly | of vehicles that our policies drive | {_READER}::test_entities
+Performance | partly | read, but vehicles have the bounds of their class | {_READER}::test_entities
 Axles | partly | the wheelbase | {_READER}::test_entities
 FrontAxle | partly | its place | {_READER}::test_entities
 RearAxle | partly | its place | {_READER}::test_entities
@@ -163,7 +163,7 @@ RelativeTargetLaneOffset | yes | | {_ACTIONS}::test_lane_offset
 LateralDistanceAction | partly | at most at the speed of its constraints | {_ACTIONS}::test_lateral_distance
 VisibilityAction | partly | the traffic flag | {_ACTIONS}::test_entities_come_and_go
 SensorReferenceSet | passive | no single sensor is switched off | {_READER}::test_passive_elements
-SynchronizeAction | yes | | {_ACTIONS}::test_synchronize
+SynchronizeAction | partly | without tolerances | {_ACTIONS}::test_synchronize
 TargetPositionMaster | yes | | {_ACTIONS}::test_synchronize
 TargetPosition | yes | | {_ACTIONS}::test_synchronize
 FinalSpeed | yes | | {_ACTIONS}::test_synchronize
