@@ -9,20 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limsim_jax.report.draw.painter import INK
-from limsim_jax.report.strip import (
-    BODY_POINT,
-    FALSE,
-    FALSE_BY_DAY,
-    FOUND,
-    FOUND_BY_DAY,
-    GROUND_POINT,
-    NIGHT,
-    REACH,
-    SURFACES,
-    cloud,
-    corners,
-    surfaces,
-)
+from limsim_jax.report.strip import INKS, REACH, SURFACES, cloud, corners, surfaces
 from limsim_jax.sensors.bev import Raster
 from limsim_jax.sensors.camera import Pictures
 from limsim_jax.sensors.lidar import Scan
@@ -99,7 +86,7 @@ def draw_sheet(
 
 def _draw_points(ax: Axes, rig: Rig, scan: Scan | None, objects: Objects, size: tuple[float, float]) -> None:
     """The point cloud from above, ahead is up; boxes of the object list."""
-    ax.set_facecolor(NIGHT)
+    ax.set_facecolor(INKS["night"])
     ax.set_aspect("equal")
     half = REACH * 1.28
     ax.set_xlim(half, -half)
@@ -107,11 +94,11 @@ def _draw_points(ax: Axes, rig: Rig, scan: Scan | None, objects: Objects, size: 
     words = "no LiDAR"
     if scan is not None and rig.lidar is not None:
         points, back, struck = cloud(rig.lidar, scan)
-        for mask, color, dot in ((back & ~struck, GROUND_POINT, 0.5), (struck, BODY_POINT, 2.2)):
+        for mask, color, dot in ((back & ~struck, INKS["ground"], 0.5), (struck, INKS["body"], 2.2)):
             ax.scatter(points[mask, 1], points[mask, 0], s=dot, c=color, linewidths=0)
         layers = len(rig.lidar.elevations)
         words = f"LiDAR, {layers} layer{'s' * (layers > 1)}: {int(back.sum()):,} points"
-    _boxes(ax, objects, FOUND, FALSE)
+    _boxes(ax, objects, INKS["found"], INKS["false"])
     _own(ax, size, "white")
     ax.set_title(f"{words}, and the object list", fontsize=9, color=INK, loc="left", pad=3)
 
@@ -130,7 +117,7 @@ def _draw_raster(
         x, y, vx, vy = (float(v[k]) for v in (objects.x, objects.y, objects.vx, objects.vy))
         if abs(y) < raster.side and -raster.behind < x < raster.ahead:
             ax.plot([y, y + vy], [x, x + vx], color=INK, lw=1.2)
-    _boxes(ax, objects, FOUND_BY_DAY, FALSE_BY_DAY, clip=raster)
+    _boxes(ax, objects, INKS["found_by_day"], INKS["false_by_day"], clip=raster)
     _own(ax, size, INK)
     ax.set_title(
         f"bird's-eye view, {raster.cell:g} m cells; object list with a second of way",

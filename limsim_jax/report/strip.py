@@ -6,7 +6,6 @@ Videos and pictures have it below the traffic. Pillow is imported when something
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -28,11 +27,19 @@ REACH = 40.0
 SURFACES = (COLORS[Label.TERRAIN], (150, 154, 160), (120, 190, 150), (245, 245, 240), (44, 92, 160))
 """Red, green, blue of a cell of the bird's-eye view: country, drivable, route, mark, occupied."""
 
-NIGHT, GROUND_POINT, BODY_POINT = "#14181d", "#6c7a89", "#ffd166"
-FOUND, FALSE = "#7fd1ff", "#ff9d76"
-"""Object list: true entries and false tracks, on the dark ground of the point cloud."""
-FOUND_BY_DAY, FALSE_BY_DAY = "#0072b2", "#d55e00"
-"""The same in the bird's-eye view."""
+INKS = {
+    "night": "#14181d",
+    "ground": "#6c7a89",
+    "body": "#ffd166",
+    "found": "#7fd1ff",
+    "false": "#ff9d76",
+    "found_by_day": "#0072b2",
+    "false_by_day": "#d55e00",
+}
+"""Of the point cloud: its dark ground, and points of the road and of vehicles.
+
+Then of the object list: true entries and false tracks there, and the same in the bird's-eye view.
+"""
 
 _MOST_HEIGHT = 320  # pixels of a strip that is 1,280 wide
 _GAP = 4  # pixels
@@ -181,7 +188,7 @@ class Strip:
 
         film = self.film
         assert film.scan is not None and film.rig.lidar is not None
-        page = Image.new("RGB", (wide, self._inner), NIGHT)
+        page = Image.new("RGB", (wide, self._inner), INKS["night"])
         pen = ImageDraw.Draw(page)
         scale = min(wide, self._inner) / 2 / REACH
         middle = np.array([wide / 2, self._inner / 2])
@@ -189,10 +196,10 @@ class Strip:
         points, back, struck = cloud(film.rig.lidar, scan)
         at = np.round(middle - scale * points[..., 1::-1]).astype(int)  # ahead is up, left is left
         inside = back & (at >= 1).all(-1) & (at < (wide - 1, self._inner - 1)).all(-1)
-        pen.point([tuple(p) for p in at[inside & ~struck].tolist()], fill=GROUND_POINT)
+        pen.point([tuple(p) for p in at[inside & ~struck].tolist()], fill=INKS["ground"])
         for x, y in at[inside & struck].tolist():
-            pen.rectangle((x - 1, y - 1, x, y), fill=BODY_POINT)
-        self._boxes(pen, k, scale, middle, FOUND, FALSE)
+            pen.rectangle((x - 1, y - 1, x, y), fill=INKS["body"])
+        self._boxes(pen, k, scale, middle, INKS["found"], INKS["false"])
         self._own(pen, scale, middle, "#ffffff")
         _label(pen, 0, 0, f"LiDAR, {int(back.sum()):,} points")
         return page
@@ -206,7 +213,7 @@ class Strip:
         pen = ImageDraw.Draw(page)
         scale = self._inner / (raster.ahead + raster.behind)
         middle = np.array([wide / 2, scale * raster.ahead])
-        self._boxes(pen, k, scale, middle, FOUND_BY_DAY, FALSE_BY_DAY)
+        self._boxes(pen, k, scale, middle, INKS["found_by_day"], INKS["false_by_day"])
         self._own(pen, scale, middle, INK)
         _label(pen, 0, 0, "bird's-eye view")
         return page
@@ -269,8 +276,4 @@ def write_strips(path: Path, film: FilmLike, *, fps: float | None = None) -> Non
         fps = float(np.clip(1 / np.median(np.diff(time)), 0.1, 100)) if len(time) > 1 else 1.0
     check_video(path, fps)
     strip = Strip(film)
-
-    def frames() -> Iterator[NDArray[np.uint8]]:
-        return (strip.draw(k) for k in range(len(time)))
-
-    write_frames(path, frames(), fps, palette(film))
+    write_frames(path, (strip.draw(k) for k in range(len(time))), fps, palette(film))

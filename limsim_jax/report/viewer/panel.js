@@ -177,32 +177,35 @@ function frame(now) {
     if (on >= last) setPlaying(false);
   }
   before = now;
-  if (dirty) {
-    dirty = false;
-    draw();
-    drawSense();
-    inspect();
-    const share = last > first ? (t - first) / (last - first) : 1;
-    $("done").style.width = $("knob").style.left = `${100 * share}%`;
-    $("now").textContent = `${t.toFixed(1)} s`;
-    const count = poses.filter(Boolean).length;
-    $("count").textContent = String(count);
-    $("countword").textContent = count === 1 ? "vehicle" : "vehicles";
-    $("time").setAttribute("aria-valuenow", t.toFixed(2));
-    $("time").setAttribute("aria-valuetext", `${t.toFixed(1)} seconds`);
-    $("follow").setAttribute("aria-pressed", String(follow));
-    $("before").disabled = !meta.moments.some(m => m.time < t - 1e-3);
-    $("after").disabled = !meta.moments.some(m => m.time > t + 1e-3);
-    momentButtons.forEach(([moment, button]) => button.setAttribute("aria-current", String(moment === focus && Math.abs(t - moment.time) < 0.5)));
-    scaleBar();
-    if (!playing && before !== null) tellAddress();
-    shown.time = t.toFixed(4); shown.step = k; shown.playing = playing; shown.speed = speed; shown.count = count;
-    shown.selected = sel ? sel.slot : ""; shown.follow = follow; shown.colour = colour;
-    shown.scale = view.scale; shown.x = view.x + net.origin[0]; shown.y = view.y + net.origin[1];
-    shown.vehicles = poses.map((p, slot) => [slot, X(p.x).toFixed(1), Y(p.y).toFixed(1)].join(",")).filter(Boolean).join(" ");
-    shown.ready = 1;
-  }
+  show();
   requestAnimationFrame(frame);
+}
+function show() {
+  if (!dirty) return;
+  dirty = false;
+  draw();
+  drawSense();
+  tellAnswer();
+  inspect();
+  const share = last > first ? (t - first) / (last - first) : 1;
+  $("done").style.width = $("knob").style.left = `${100 * share}%`;
+  $("now").textContent = `${t.toFixed(1)} s`;
+  const count = poses.filter(Boolean).length;
+  $("count").textContent = String(count);
+  $("countword").textContent = count === 1 ? "vehicle" : "vehicles";
+  $("time").setAttribute("aria-valuenow", t.toFixed(2));
+  $("time").setAttribute("aria-valuetext", `${t.toFixed(1)} seconds`);
+  $("follow").setAttribute("aria-pressed", String(follow));
+  $("before").disabled = !meta.moments.some(m => m.time < t - 1e-3);
+  $("after").disabled = !meta.moments.some(m => m.time > t + 1e-3);
+  momentButtons.forEach(([moment, button]) => button.setAttribute("aria-current", String(moment === focus && Math.abs(t - moment.time) < 0.5)));
+  scaleBar();
+  if (!playing && before !== null) tellAddress();
+  shown.time = t.toFixed(4); shown.step = k; shown.playing = playing; shown.speed = speed; shown.count = count;
+  shown.selected = sel ? sel.slot : ""; shown.follow = follow; shown.colour = colour;
+  shown.scale = view.scale; shown.x = view.x + net.origin[0]; shown.y = view.y + net.origin[1];
+  shown.vehicles = poses.map((p, slot) => [slot, X(p.x).toFixed(1), Y(p.y).toFixed(1)].join(",")).filter(Boolean).join(" ");
+  shown.ready = 1;
 }
 function scaleBar() {
   const room = 110 / view.scale, unit = 10 ** Math.floor(Math.log10(room));
@@ -359,7 +362,8 @@ if (egoStay) {
   $("egosign").hidden = false;
   $("egosign").querySelector("i").style.background = meta.colors.ego;
 }
-$("sensekey").hidden = $("sensetext").hidden = !sense;
+$("sensekey").hidden = $("sensetext").hidden = $("believed").hidden = !sense;
+if (sense) $("believed").querySelector("i").style.border = `1.5px solid ${sense.colors.found_by_day}`;
 if (meta.plan) {
   $("planned").hidden = false;
   $("planned").querySelector("i").style.borderTop = `2.5px solid ${meta.colors.ego}`;
@@ -431,7 +435,8 @@ function tellAddress() {
   clearTimeout(waits);
   waits = setTimeout(() => { try { history.replaceState(null, "", at); } catch { /* within the frame of a notebook */ } }, 300);
 }
-new ResizeObserver(resize).observe($("stage"));
+// A canvas is empty after a change of its size: it is drawn before that is shown.
+new ResizeObserver(() => { resize(); show(); }).observe($("stage"));
 new ResizeObserver(() => { dirty = true; }).observe($("sense"));
 prefersDark.addEventListener("change", setPalette);
 setPalette();

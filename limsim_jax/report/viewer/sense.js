@@ -49,7 +49,8 @@ function paper(name) {  // the canvas in pixels of the screen; its pen draws in 
 }
 function tag(ctx, x, y, text, room) {
   ctx.font = "11px system-ui, sans-serif"; ctx.textAlign = "left"; ctx.textBaseline = "top";
-  if (ctx.measureText(text).width + 8 > room) text = text.split(",")[0];
+  text = [text, text.split(",")[0], text.split(" ")[0]].find(x => ctx.measureText(x).width + 8 <= room) ?? "";
+  if (!text) return;
   ctx.fillStyle = "#ffffffcc"; ctx.fillRect(x, y, ctx.measureText(text).width + 8, 16);
   ctx.fillStyle = "#2f3742"; ctx.fillText(text, x + 4, y + 2.500);
 }
@@ -121,7 +122,7 @@ function drawSense() {
     }
     boxes(ctx, f, to, sense.colors.found, sense.colors.false);
     own(ctx, to, "#ffffff");
-    tag(ctx, 0, 0, `LiDAR, ${points} points`, wide);
+    tag(ctx, 0, 0, `LiDAR, ${points.toLocaleString("en")} points`, wide);
     shown.points = points;
   }
   const {ahead, behind, shape: [down, across], words} = sense.raster, [ctx, wide, high] = paper("bev");

@@ -8,22 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limsim_jax.maps.lane_map import LaneMap, absolute
-from limsim_jax.report.strip import (
-    BODY_POINT,
-    FALSE,
-    FALSE_BY_DAY,
-    FOUND,
-    FOUND_BY_DAY,
-    GROUND_POINT,
-    NIGHT,
-    REACH,
-    SURFACES,
-    FilmLike,
-    grid,
-    pack_colors,
-    palette,
-    surfaces,
-)
+from limsim_jax.report.strip import INKS, REACH, SURFACES, FilmLike, grid, pack_colors, palette, surfaces
 from limsim_jax.report.viewer.pack import Pack, held, origin
 
 UNIT = 0.1
@@ -41,10 +26,7 @@ def add_sensed(pack: Pack, lane_map: LaneMap, film: FilmLike) -> dict[str, Any]:
     time = np.asarray(film.time, float)
     pack.add("sense_time", time[None], 10_000)
     meta: dict[str, Any] = {"frames": len(time), "size": list(film.size), "reach": REACH}
-    meta["colors"] = {
-        "night": NIGHT, "ground": GROUND_POINT, "body": BODY_POINT, "found": FOUND, "false": FALSE,
-        "found_by_day": FOUND_BY_DAY, "false_by_day": FALSE_BY_DAY,
-    }  # fmt: skip
+    meta["colors"] = INKS
     if film.pictures is not None:
         colors = palette(film)
         pack.add_bytes("pictures", np.moveaxis(_indices(film.pictures.color, colors), 1, 0))
@@ -75,8 +57,7 @@ def add_sensed(pack: Pack, lane_map: LaneMap, film: FilmLike) -> dict[str, Any]:
     }  # fmt: skip
     meta["objects"] = _add_objects(pack, film)
     believed = film.objects.pose
-    for axis, values in zip("xy", absolute(lane_map, believed.x, believed.y), strict=True):
-        pack.add(f"sense_{axis}", np.asarray(values)[None] - origin(lane_map)["xy".index(axis)], 100)
+    pack.add_points("sense", np.stack(absolute(lane_map, believed.x, believed.y), -1), origin(lane_map))
     pack.add("sense_heading", np.asarray(believed.heading)[None], 10_000)
     return meta
 

@@ -171,8 +171,8 @@ def _write(path: Path, meta: dict[str, Any], pack: Pack) -> None:
         script=read("viewer/viewer.js")
         + read("viewer/scene.js")
         + read("viewer/sense.js")
-        + read("viewer/panel.js")
-        + read("viewer/answers.js"),
+        + read("viewer/answers.js")
+        + read("viewer/panel.js"),
     )
     write_whole(path, page)
 
