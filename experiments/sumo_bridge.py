@@ -10,7 +10,8 @@ command goes on where it was stopped. The costs of the bridge are measured once,
 A seed draws a car of the scenario's own demand; the planner takes it over within its first minutes. For both
 drivers it is the same car, at the same moment, among the same vehicles: SUMO drives them on, or we take all
 of them over. SUMO inserts vehicles, says their routes and owns the signals in both. Writes
-experiments/results/sumo_bridge.json and .md. Needs shared data, and the extra `sumo`.
+experiments/results/sumo_bridge.json and .md, where rows of other networks stay. Needs shared data, and the
+extra `sumo`.
 """
 
 from __future__ import annotations
@@ -40,7 +41,14 @@ from limsim_jax.xla import run_often
 
 RESULTS = Path(__file__).parent / "results"
 DATA = Path(os.environ.get("LIMSIM_SHARED_DATA", "shared/data")) / "sumo"
-FULL = ("ingolstadt1", "limsim_roundabout", "limsim_bigInter")
+FULL = (
+    "ingolstadt1",
+    "bologna_pasubio",
+    "limsim_roundabout",
+    "limsim_bigInter",
+    "limsim_town01",
+    "limsim_town05",
+)
 COLUMNS = ("success", "nuplan_score", "at_fault_contacts", "completion", "mean_speed", "sumo_collisions")
 CHUNK = 10  # worlds at the same time
 KEPT = 24  # decisions that are timed
@@ -230,7 +238,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) if given.out is None else given.out
         if not given.only_cost:
-            found |= {"rows": [], "horizon": horizon}
+            others = [x for x in found["rows"] if x["net"] not in nets and found["horizon"] == horizon]
+            found |= {"rows": others, "horizon": horizon}
             for more in rows(nets, policies, seeds, horizon, out):
                 found["rows"] += more
                 save(path, found)
