@@ -131,7 +131,7 @@ def without_gorges(network: Network) -> Network:
     for lane, begin, end in shut:
         message = f"no car fits from s = {begin:.1f} to {end:.1f} m: closed there"
         network.report.approximated("lane width", f"lane {lane.id}", message)
-    pieces = {name for lane, _, _ in shut for name in _pieces_of(found.lanes, lane.id)}
+    pieces = {name for lane, _, _ in shut for name in pieces_of(found.lanes, lane.id)}
     narrow = (name for name in pieces if not fits_cars(lane := found.lanes[name])[len(lane.s) // 2])
     return close(found, narrow, LaneType.NONE)
 
@@ -153,7 +153,7 @@ def _narrow(lane: Lane) -> list[tuple[float, float]]:
     return found
 
 
-def _pieces_of(lanes: Mapping[str, Lane], name: str) -> list[str]:
+def pieces_of(lanes: Mapping[str, Lane], name: str) -> list[str]:
     """The pieces of a lane, in its direction of travel."""
     found = [name]
     while (after := f"{name}/{len(found)}") in lanes:

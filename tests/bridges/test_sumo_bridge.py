@@ -19,7 +19,10 @@ from limsim_jax.bridges.sumo import link as link_module
 from limsim_jax.bridges.sumo.messages import Body, Move, Orders, Reading, Start, SumoError
 from limsim_jax.bridges.sumo.process import SumoProcess
 from limsim_jax.bridges.sumo.seats import Places, angle_of, heading_of
+from limsim_jax.maps.cut import close, cut
+from limsim_jax.maps.lane_map import NO_LANE
 from limsim_jax.maps.map import load_map
+from limsim_jax.maps.network import LaneType
 
 sumo = pytest.importorskip("sumo", reason="needs eclipse-sumo")
 
@@ -471,6 +474,44 @@ def test_another_network_than_the_map_is_refused(nets: Path) -> None:
         with pytest.raises(SumoError, match="runs another network"):
             Places(grid.network, grid.lanes, process.there)
     assert lights.network.programs
+
+
+def test_a_lane_of_sumo_may_be_several_pieces_of_the_map(nets: Path) -> None:
+    """Roads are cut where no car fits; one of the pieces is closed."""
+    grid = load_map(nets / "grid.net.xml")
+    road = grid.network.lanes["A1B1_0"].road
+    pieces = cut(grid.network, {(road, 0): [60.0, 130.0]})
+    pieces = close(pieces, ["A1B1_0/1"], LaneType.NONE)
+    rows = {lane.id: k for k, lane in enumerate(pieces.drivable_lanes())}
+    with SumoProcess(demand(nets, CAR)) as process:
+        there = process.there
+        places = Places(pieces, grid.lanes, there)
+    names = ["A1B1_0", "A1B1_0", "A1B1_0", "A1B1_1", "B1C1_0"]
+    s = np.array([10.0, 100.0, 150.0, 150.0, 100.0])
+    row, along = places.on(np.array([there.lanes.index(x) for x in names]), s)
+    expected = ["A1B1_0", None, "A1B1_0/2", "A1B1_1/2", "B1C1_0"]
+    assert row.tolist() == [NO_LANE if x is None else rows[x] for x in expected]
+    stretch = {x: grid.network.lanes[x].length / grid.network.lanes[x].declared_length for x in set(names)}
+    begins = [0.0, None, pieces.lanes["A1B1_0"].length + pieces.lanes["A1B1_0/1"].length, None, 0.0]
+    for k in (0, 2, 4):
+        assert along[k] == pytest.approx(s[k] * stretch[names[k]] - begins[k], abs=1e-6)
+    nobody = places.on(np.array([-1]), np.array([3.0]))
+    assert nobody[0].tolist() == [NO_LANE]
+
+
+@needs_shared
+def test_lanes_of_a_town_with_stretches_that_are_closed_are_found_in_sumo() -> None:
+    folder = SHARED / "sumo" / "limsim_town05"
+    town = load_map(folder / "Town05.net.xml")
+    with SumoProcess(Start(arguments=("-n", str(folder / "Town05.net.xml")), seed=1, dt=DT)) as process:
+        there = process.there
+    assert any(name not in there.lanes for name in town.network.lanes)  # pieces
+    places = Places(town.network, town.lanes, there)
+    rows = places.on(np.arange(len(there.lanes)), np.zeros(len(there.lanes)))[0]
+    drivable = {lane.id for lane in town.network.drivable_lanes()}
+    assert [x for x, row in zip(there.lanes, rows, strict=True) if row >= 0] == [
+        x for x in there.lanes if x in drivable
+    ]
 
 
 def test_a_missing_or_old_sumo_is_one_line(nets: Path, monkeypatch: pytest.MonkeyPatch) -> None:

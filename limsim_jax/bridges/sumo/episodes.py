@@ -427,12 +427,13 @@ class _World:
         """Whether a vehicle can be an ego: a car with some way to go."""
         one = self.seats.known[handle]
         k = self.reading.handle.tolist().index(handle)
-        row = int(self.seats.places.row[self.reading.lane[k]])
+        places = self.seats.places.on(self.reading.lane[[k]], self.reading.s[[k]])
+        row, s = int(places[0][0]), float(places[1][0])
         if row < 0 or ENGINE_CLASS.get(one.kind) != "car" or not one.edges:
             return False
         ways = self.seats.ways
         column = ways.take(one.edges, class_of(one))
-        fits = ways.reaches(row, column) and ways.to_go(row, column) - self.reading.s[k] >= LEAST_TRIP
+        fits = ways.reaches(row, column) and ways.to_go(row, column) - s >= LEAST_TRIP
         ways.give_back(column)
         return bool(fits)
 

@@ -7,10 +7,12 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from limsim_jax.bridges.sumo.messages import Newcomer, Reading, Started, SumoError
 from limsim_jax.bridges.sumo.program import Seen
 from limsim_jax.bridges.sumo.ways import Lights, Ways
+from limsim_jax.maps.cut import pieces_of
 from limsim_jax.maps.lane_map import NO_LANE, VEHICLE_CLASSES, LaneMap
 from limsim_jax.maps.network import Network
 from limsim_jax.maps.sumo.classes import ENGINE_CLASS
@@ -25,7 +27,7 @@ LENGTH_ERROR = 0.1
 
 
 class Places:
-    """SUMO's lanes as rows of the map.
+    """SUMO's lanes as rows of the map, where a lane may be several pieces (see `maps.cut`).
 
     Args:
       network, lane_map: the map.
@@ -36,25 +38,36 @@ class Places:
     """
 
     def __init__(self, network: Network, lane_map: LaneMap, there: Started) -> None:
-        lengths = dict(zip(there.lanes, there.lengths.tolist(), strict=True))
-        drivable = list(network.drivable_lanes())
-        for lane in drivable:
-            if lane.id not in lengths:
-                raise SumoError(f"SUMO has no lane '{lane.id}' of {network.source}: it runs another network")
-            declared = lane.length if lane.declared_length is None else lane.declared_length
-            if abs(declared - lengths[lane.id]) > LENGTH_ERROR:
+        rows = {lane.id: k for k, lane in enumerate(network.drivable_lanes())}
+        pieces = [pieces_of(network.lanes, name) if name in network.lanes else [] for name in there.lanes]
+        unknown = rows.keys() - {x for found in pieces for x in found}
+        if unknown:
+            name = min(unknown, key=rows.__getitem__)
+            raise SumoError(f"SUMO has no lane '{name}' of {network.source}: it runs another network")
+        shape = len(pieces) + 1, max(map(len, pieces), default=1)
+        self._row = np.full(shape, NO_LANE, np.int32)  # [SUMO's lane or none, piece]
+        self._begin = np.full(shape, np.inf)  # m along SUMO's lane
+        self._begin[:, 0] = 0.0
+        self._scale = np.ones(shape)  # our m per m of SUMO
+        for k, (name, length, found) in enumerate(zip(there.lanes, there.lengths, pieces, strict=True)):
+            lanes = [network.lanes[x] for x in found]
+            ends = np.cumsum([x.length if x.declared_length is None else x.declared_length for x in lanes])
+            if any(x in rows for x in found) and abs(ends[-1] - length) > LENGTH_ERROR:
                 raise SumoError(
-                    f"lane '{lane.id}' is {lengths[lane.id]:.2f} m long in SUMO and {declared:.2f} m in "
+                    f"lane '{name}' is {length:.2f} m long in SUMO and {ends[-1]:.2f} m in "
                     f"{network.source}: SUMO runs another network"
                 )
-        rows = {lane.id: k for k, lane in enumerate(drivable)}
-        self.row = np.array([*(rows.get(name, NO_LANE) for name in there.lanes), NO_LANE], np.int32)
-        ours = np.array([lane.length for lane in drivable])
-        known = np.maximum(there.lengths, 1e-3)
-        self.scale = np.array(
-            [ours[row] / known[k] if row >= 0 else 1.0 for k, row in enumerate(self.row[:-1])] + [1.0]
-        )
+            begins = np.concatenate([[0.0], ends[:-1]])
+            self._begin[k, : len(lanes)] = begins
+            self._row[k, : len(lanes)] = [rows.get(x, NO_LANE) for x in found]
+            known = np.maximum(np.diff([*begins, length]), 1e-3)
+            self._scale[k, : len(lanes)] = [x.length for x in lanes] / known
         self.origin = np.asarray(lane_map.origin, np.float64)
+
+    def on(self, lane: NDArray[Any], s: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Rows of the map and m along them, from SUMO's lanes (-1: none) and m along those; `[n]` each."""
+        piece = np.sum(self._begin[lane] <= s[:, None], -1) - 1
+        return self._row[lane, piece], (s - self._begin[lane, piece]) * self._scale[lane, piece]
 
 
 class Seats:
@@ -109,7 +122,7 @@ class Seats:
     def see(self, reading: Reading, *, alive: bool = True) -> Seen:
         """A moment as arrays: seats are given and given back."""
         arrived, fresh = (np.zeros(self.slots, bool) for _ in range(2))
-        row = self.places.row[reading.lane]
+        row, s = self.places.on(reading.lane, reading.s)
         kept = reading.owned & self.slot.keys()  # ours keep their seat wherever SUMO sees them
         on = {h: k for k, h in enumerate(reading.handle.tolist()) if row[k] >= 0 or h in kept}
         self.elsewhere = max(self.elsewhere, int(np.sum((row < 0) & (reading.lane >= 0))))
@@ -135,18 +148,18 @@ class Seats:
         for handle, edges in reading.routes.items():
             if handle in self.slot and handle not in self.egos:
                 self._follow(handle, edges)
-        return self._arrays(reading, on, row, arrived, fresh, lost, alive)
+        return self._arrays(reading, on, row, s, arrived, fresh, lost, alive)
 
     def _arrays(
-        self, reading: Reading, on: dict[int, int], row: np.ndarray, arrived: np.ndarray, fresh: np.ndarray,
-        lost: int, alive: bool,
+        self, reading: Reading, on: dict[int, int], row: np.ndarray, s: np.ndarray, arrived: np.ndarray,
+        fresh: np.ndarray, lost: int, alive: bool,
     ) -> Seen:  # fmt: skip
         pairs = [(slot, on[h]) for h, slot in self.slot.items() if h in on]
         slot, k = np.array(pairs, int).reshape(-1, 2).T
         x0, y0 = self.places.origin
         columns = {
             "lane": (row, np.int32, NO_LANE),
-            "s": (reading.s * self.places.scale[reading.lane], np.float32, 0),
+            "s": (s, np.float32, 0),
             "x": (reading.x - x0, np.float32, 0),
             "y": (reading.y - y0, np.float32, 0),
             "heading": (heading_of(reading.angle), np.float32, 0),
