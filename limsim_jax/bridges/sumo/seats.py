@@ -27,7 +27,7 @@ LENGTH_ERROR = 0.1
 
 
 class Places:
-    """SUMO's lanes as rows of the map, where a lane may be several pieces (see `maps.cut`).
+    """SUMO's lanes as rows of the map; one may be several pieces (`maps.cut`).
 
     Args:
       network, lane_map: the map.
