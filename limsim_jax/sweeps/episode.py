@@ -143,7 +143,7 @@ class Episodes:
         self.world_bytes = self._memory()
         self.chunk = self._chunk() if chunk is None else chunk
         run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
-        source, slots = _source_hash(), experiment.slots
+        source, slots = source_hash(), experiment.slots
         sumo = self._sumo
         drawn = self.lane_map, self._demand, self._egos, self._placed, self._script, slots
         if sumo is not None:
@@ -518,7 +518,7 @@ def provenance_of(
         # where to find the map again: a bundled one by its name
         "map_file": experiment.map if experiment.map in bundled_maps() else os.path.abspath(experiment.map),
         "version": limsim_jax.__version__,
-        "source": _source_hash(),
+        "source": source_hash(),
         "chunk": chunk,
         "platform": device.platform,
         "device": device.device_kind,
@@ -531,7 +531,7 @@ def provenance_of(
 
 
 @cache
-def _source_hash() -> str:
+def source_hash() -> str:
     """Of all code, and weights, that make rows: rows of other code are other rows."""
     package = Path(limsim_jax.__file__).parent
     hashed = hashlib.sha256()

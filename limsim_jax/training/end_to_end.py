@@ -35,6 +35,7 @@ from limsim_jax.policies.end_to_end.network import (
     save_weights,
     two_hot,
 )
+from limsim_jax.sweeps.episode import source_hash
 from limsim_jax.training.collect import Field, Labels, Sample
 from limsim_jax.training.hybrid import SCENARIOS
 
@@ -408,6 +409,7 @@ class _Training:
         seeds = {f.scenario: [FIRST_SEED, f.next_seed - 1] for f in self.fields}
         about = {
             "version": limsim_jax.__version__,
+            "source": source_hash(),
             "jax": jax.__version__,
             "device": f"{jax.local_device_count()} x {jax.local_devices()[0].device_kind}",
             "seconds": round(self.elapsed, 1),

@@ -253,6 +253,20 @@ def test_free_distances_are_those_to_the_boxes():
     assert (np.asarray(here) > 500).all()  # an object on the ego itself is an error of the map
 
 
+def test_a_follower_does_not_hold_the_ego():
+    """Standing still does not avoid it, so it is no reason to stand."""
+    way, size = straight(), (jnp.full(1, 5.0), jnp.full(1, 2.0))
+    for back, v in ((12.0, 13.0), (9.0, 5.0), (14.0, 14.0)):
+        behind = free_distances(way, objects_of(density_with((-back, 0.0, 0.0, 4.0, 2.0, v))), *size)
+        assert (np.asarray(behind) > 500).all(), (back, v)
+    # from the right, across the path ahead of the ego: it counts
+    across = free_distances(way, objects_of(density_with((8.0, -8.0, np.pi / 2, 4.0, 2.0, 8.0))), *size)
+    assert np.asarray(across)[0, 2] < 8.0
+    # into the side of the ego: it does not, from then on
+    into = free_distances(way, objects_of(density_with((0.0, -8.0, np.pi / 2, 4.0, 2.0, 8.0))), *size)
+    assert (np.asarray(into)[0, 2:] > 500).all()
+
+
 def test_the_safe_speed_ends_the_way_before_the_object():
     v = jnp.array([10.0, 10.0, 3.0, 10.0])
     free = jnp.array([[1e3] * 5, [12.0] * 5, [12.0] * 5, [1.0, 1e3, 1e3, 1e3, 1e3]])

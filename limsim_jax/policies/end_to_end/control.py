@@ -225,7 +225,8 @@ def free_distances(
 ) -> Float[Array, "E 5"]:
     """Distances (m) on the path to an object, at `MOMENTS`.
 
-    An object that overlaps the ego where it stands does not count: it is the map's error, or too late.
+    An object that comes to overlap the ego where it stands does not count from then on: standing still does
+    not avoid it. It is a follower, or an error of the density map.
     """
     share = np.linspace(0, way.x.shape[-1] - 1, _PLACES + 1).round().astype(int)[1:]
     place = way.step[:, None] * jnp.asarray(share, jnp.float32)[None]  # m, [E P]
@@ -242,8 +243,8 @@ def free_distances(
         rest = (jnp.broadcast_to(z[None], ox.shape) for z in (o.heading, o.length, o.width))
         box = jnp.stack([ox, oy, *rest], -1)  # [M K 5]
         hit = jax.vmap(lambda a: jax.vmap(jax.vmap(lambda b: boxes_overlap(a, b)))(box))(at)  # [P M K]
-        inside = jax.vmap(lambda b: boxes_overlap(body, b))(box[0])
-        hit &= (o.there & ~inside)[None, None]
+        inside = jax.vmap(jax.vmap(lambda b: boxes_overlap(body, b)))(box)  # [M K]
+        hit &= o.there[None, None] & ~lax.cummax(inside.astype(jnp.int32)).astype(bool)[None]
         return jnp.min(jnp.where(hit.any(-1), place[:, None], 1e3), 0)
 
     return jax.vmap(one)(
