@@ -3,13 +3,15 @@
     python experiments/language.py [--seeds 8] [--horizon 40] [--experiments highway,intersection]
     python experiments/language.py --full
     python experiments/language.py --small-model [--seeds 3] [--horizon 60]
+    python experiments/language.py --camera WEIGHTS [--seeds 20]
     python experiments/language.py --server URL --model NAME [--seeds 20]
 
 The first two show that descriptions and actions lose nothing: the model reads the text of a scene alone.
 `--full` has 100 seeds and whole episodes. They also run again from the cache, and with a latency of 0 s.
 
 `--small-model` starts SmolLM2-135M on this machine (extra `llm-test`): a test of transport, schema and
-parsing with a real model. It cannot drive. `--server` asks a model of yours, with the key of $OPENAI_API_KEY.
+parsing with a real model. It cannot drive. `--camera` drives by pictures over the same protocol, with a small
+network of `limsim-jax train end-to-end --design camera`. `--server` asks a model of yours, with the key of $OPENAI_API_KEY.
 
 All write experiments/results/language.json and .md.
 """
@@ -31,6 +33,7 @@ from typing import Any
 
 import numpy as np
 
+from limsim_jax.bridges.chat.camera import Camera
 from limsim_jax.bridges.chat.server import ChatServer
 from limsim_jax.files import write_whole
 from limsim_jax.policies.language.answers import CallStatus
@@ -55,6 +58,7 @@ def main() -> None:
     parser.add_argument("--horizon", type=float, help="s; of the experiment with --full and --server")
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--small-model", action="store_true")
+    parser.add_argument("--camera", type=Path, help="weights of the network that looks at pictures")
     parser.add_argument("--server", help="up to /v1")
     parser.add_argument("--model", default=os.environ.get("LIMSIM_MODEL"))
     parser.add_argument("--style", default="plain")
@@ -69,6 +73,11 @@ def main() -> None:
             row = real(names[:1], range(told.seeds or 3), told.horizon or 60.0, url, model, told.style)
         row |= {"parsed": row["statuses"]["ok"] + row["statuses"]["repaired"]}
         keep(told.out, "small_model", row)
+    elif told.camera:
+        with ChatServer({"camera": Camera(told.camera)}) as server:
+            look = {"style": "limsim_pp_vision", "cameras": "driver"}
+            row = real(names, range(told.seeds or 20), told.horizon, server.url, "camera", **look)
+        keep(told.out, "camera network", row)
     elif told.server:
         row = real(names, range(told.seeds or 20), told.horizon, told.server, told.model, told.style)
         keep(told.out, f"model {told.model}", row)
@@ -114,14 +123,21 @@ def beside(name: str, seeds: Sequence[int], horizon: float | None) -> dict[str, 
 
 
 def real(
-    names: Sequence[str], seeds: Sequence[int], horizon: float | None, url: str, model: str, style: str
+    names: Sequence[str],
+    seeds: Sequence[int],
+    horizon: float | None,
+    url: str,
+    model: str,
+    style: str,
+    cameras: str | None = None,
 ) -> dict[str, Any]:
     """A real model in experiments."""
     found: dict[str, Any] = {}
     outcomes: list[Outcome] = []
     start = time.monotonic()
     for name in names:
-        one = worlds(name, horizon, language(url, model, style=style, timeout=120.0), min(len(seeds), 20))
+        policy = language(url, model, style=style, timeout=120.0, cameras=cameras)
+        one = worlds(name, horizon, policy, min(len(seeds), 20))
         some = whole(one, seeds)
         outcomes += some
         found[name] = figures(some) | {"seeds": len(seeds), "horizon": one.experiment.horizon}

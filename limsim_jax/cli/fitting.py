@@ -191,6 +191,10 @@ def train(
     scenarios: Annotated[
         str | None, typer.Option(help="end-to-end: names or files, by commas.  [default: the five]")
     ] = None,
+    design: Annotated[
+        Literal["whole", "camera"],
+        typer.Option(help="end-to-end: camera has no LiDAR and no route, for `serve chat`."),
+    ] = "whole",
 ) -> None:
     """Train a policy's network on rollouts of the bundled scenarios.
 
@@ -205,13 +209,16 @@ def train(
     use_all_cores()
     enable_compilation_cache()
     if what == "end-to-end":
+        from limsim_jax.policies.end_to_end import network
         from limsim_jax.training import end_to_end
 
+        made = network.CAMERA if design == "camera" else network.WHOLE
         names = end_to_end.SCENARIOS if scenarios is None else [x for x in scenarios.split(",") if x]
         tell = partial(print, flush=True)
-        print(
-            end_to_end.train(out, scenarios=names, rounds=rounds, worlds=worlds, minutes=minutes, tell=tell)
+        report = end_to_end.train(
+            out, scenarios=names, rounds=rounds, worlds=worlds, minutes=minutes, design=made, tell=tell
         )
+        print(report)
     else:
         from limsim_jax.training import train as fit
 

@@ -50,8 +50,13 @@ def chat(
         typer.Option(
             metavar="NAME",
             help="rules: reads the description and answers by a table of rules; faults: every fault of real "
-            "servers in turn; may be repeated.  [default: both]",
+            "servers in turn; camera: a network that looks at the pictures; may be repeated.  "
+            "[default: rules and faults]",
         ),
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(help="camera: its network, of `train end-to-end --design camera`."),
     ] = None,
     host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="0: any free one.")] = 8080,
@@ -64,17 +69,24 @@ def chat(
     Language drivers can be tried on it."""
     from limsim_jax.bridges.chat.faults import Faults
     from limsim_jax.bridges.chat.rules import rules
-    from limsim_jax.bridges.chat.server import ChatServer
+    from limsim_jax.bridges.chat.server import ChatServer, Model
 
     key = ""
     if key_variable is not None:
         key = os.environ.get(key_variable, "")
         if not key:
             raise typer.BadParameter(f"${key_variable} is empty", param_hint="--key-variable")
-    known = {"rules": rules, "faults": Faults()}
-    for name in model or ():
-        if name not in known:
-            raise typer.BadParameter(f"'{name}'; known are {', '.join(known)}", param_hint="--model")
-    server = ChatServer({name: known[name] for name in model or known}, host=host, port=port, key=key)
+    known: dict[str, Model] = {"rules": rules, "faults": Faults()}
+    names = list(known) if model is None else model
+    for name in names:
+        if name not in (*known, "camera"):
+            raise typer.BadParameter(f"'{name}'; known are {', '.join(known)}, camera", param_hint="--model")
+    if ("camera" in names) != (weights is not None):
+        raise typer.BadParameter("goes with --model camera, and that with it", param_hint="--weights")
+    if weights is not None:
+        from limsim_jax.bridges.chat.camera import Camera
+
+        known["camera"] = Camera(weights)
+    server = ChatServer({name: known[name] for name in names}, host=host, port=port, key=key)
     print(f"listening on {server.url}, models: {', '.join(server.models)}", flush=True)
     server.wait()

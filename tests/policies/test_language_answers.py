@@ -387,7 +387,7 @@ def test_the_server_of_the_command_line(capsys, monkeypatch):
     with server:
         found, _ = drive(server, model="rules", key_variable="MY_KEY")
         assert found == [[Meta.ACCELERATE]], "as the rules in JAX"
-    wrong = {"--model=gpt": "'gpt'; known are rules, faults", "--key-variable=NO": "$NO is empty"}
+    wrong = {"--model=gpt": "'gpt'; known are rules, faults, camera", "--key-variable=NO": "$NO is empty"}
     for change, text in wrong.items():
         assert cli.main(["serve", "chat", change]) == 2
         assert text in capsys.readouterr().err

@@ -70,18 +70,27 @@ class Design:
 
     Attributes:
       cameras, lidar: whether it sees them.
+      route: whether it knows the route and its own motion; otherwise only `TOLD`, and the path that it says
+        is the route.
       waypoints: whether it predicts points in time instead of a path and a speed.
       hidden: width of the common layers.
     """
 
     cameras: bool = True
     lidar: bool = True
+    route: bool = True
     waypoints: bool = False
     hidden: int = 192
 
 
 WHOLE = Design()
 """The design of the network that comes with the package."""
+
+CAMERA = Design(lidar=False, route=False)
+"""Pictures, and what a text can tell: see `bridges.chat.camera`."""
+
+TOLD = ("speed", "speed limit", "lanes to cross", "distance within which to cross them", "speed is told")
+"""Numbers of `EGO` that a network without a route has."""
 
 
 class Outputs(NamedTuple):
@@ -134,7 +143,10 @@ class Network(nn.Module):
     def __call__(self, inputs: Inputs) -> Outputs:
         """What it says of inputs `[*b, ...]`."""
         batch = inputs.ego.shape[:-1]
-        parts = [_scaled_route(inputs.route), inputs.ego]
+        if self.design.route:
+            parts = [_scaled_route(inputs.route), inputs.ego]
+        else:
+            parts = [inputs.ego[..., k, None] for k in map(EGO.index, TOLD)]
         window = None
         if self.design.cameras:
             parts.append(self._pictures(inputs.cameras))

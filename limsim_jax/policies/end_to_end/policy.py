@@ -209,8 +209,9 @@ class EndToEnd(Policy):
             way, moves = _even(x, y, far), 0.0 * v
         else:
             target = target_speed(v, said.speed)
-            way = way_along(seen.path, pose, places, said.path, offset[:, 0])
-            moves = said.path[:, -1] - offset[:, 0]
+            offsets = said.path if self.trained.design.route else jnp.zeros_like(said.path)
+            way = way_along(seen.path, pose, places, offsets, offset[:, 0])
+            moves = offsets[:, -1] - offset[:, 0]
         if self.filter:
             free = free_distances(way, objects_of(said.density), shape.length[slot], shape.width[slot])
             target, held = filtered(v, target, free, said.rules, memory.held, config.decision_time)

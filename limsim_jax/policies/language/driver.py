@@ -473,8 +473,8 @@ def language(
       max_cost: in the currency of the prices.
       prompt_price: of a million tokens.
       answer_price: of a million tokens.
-      cameras: whose pictures are sent, a rig or "front", "three" or "six"; None: "three" with a style for
-        vision, otherwise no pictures.
+      cameras: whose pictures are sent, a rig or "front", "three", "six" or "driver"; None: "three" with a
+        style for vision, otherwise no pictures.
       check: whether the server is asked now for its models.
 
     Raises:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.policies.base import scenery_of
+from limsim_jax.policies.end_to_end.inputs import front_rig
 from limsim_jax.sensors.camera import take_pictures
 from limsim_jax.sensors.rig import Rig, front_cameras, six_cameras
 from limsim_jax.sensors.scene import bodies_around, pose_of, scene_of
@@ -21,8 +22,8 @@ from limsim_jax.types import State
 SIZE = 224, 126
 """Pixels of a picture: 6 of them are about 3 kB. LimSim++ stores 560 x 315."""
 
-CAMERAS = ("front", "three", "six")
-"""Names of rigs: the front camera, the three front ones and all six of LimSim++."""
+CAMERAS = ("front", "three", "six", "driver")
+"""Names of rigs: the front camera, the three front ones and all six of LimSim++; those of `end_to_end`."""
 
 
 def rig_of(cameras: Rig | str) -> Rig:
@@ -37,6 +38,8 @@ def rig_of(cameras: Rig | str) -> Rig:
         return cameras
     if cameras not in CAMERAS:
         raise ValueError(f"cameras: '{cameras}'; known are {', '.join(CAMERAS)}, or a limsim_jax.Rig")
+    if cameras == "driver":
+        return front_rig()
     if cameras == "six":
         return six_cameras(*SIZE)
     rig = front_cameras(*SIZE)
