@@ -11,7 +11,8 @@ The first two show that descriptions and actions lose nothing: the model reads t
 
 `--small-model` starts SmolLM2-135M on this machine (extra `llm-test`): a test of transport, schema and
 parsing with a real model. It cannot drive. `--camera` drives by pictures over the same protocol, with a small
-network of `limsim-jax train end-to-end --design camera`. `--server` asks a model of yours, with the key of $OPENAI_API_KEY.
+network of `limsim-jax train end-to-end --design camera`. `--server` asks a model of yours, with the key of
+$OPENAI_API_KEY.
 
 All write experiments/results/language.json and .md.
 """
