@@ -13,6 +13,7 @@ from limsim_jax.policies.language.driver import language
 from limsim_jax.policies.language.rules import RuleTable
 from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.pdm import PDMClosed, PDMHybrid
+from limsim_jax.policies.r157 import CarefulDriver, EmergencyBrake, FuzzyDriver, Regulation, RssDriver
 from limsim_jax.policies.simple import ConstantSpeed, FollowLane
 
 
@@ -83,5 +84,10 @@ POLICIES: dict[str, Callable[..., PolicyLike]] = {
     "delayed": late,
     "rule_table": RuleTable,
     "language": language,
+    "r157_careful": CarefulDriver,
+    "r157_aeb": EmergencyBrake,
+    "r157_regulation": Regulation,
+    "r157_fsm": FuzzyDriver,
+    "r157_rss": RssDriver,
 }
 """Factories by name; other policies are named by module and factory, `package.module:factory`."""

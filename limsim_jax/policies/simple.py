@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from limsim_jax.maps.lane_map import LaneMap, pose
 from limsim_jax.policies.base import Policy
@@ -57,25 +58,36 @@ class ConstantSpeed(Policy):
     ) -> tuple[Command, Any]:
         """Steer to the point ahead and hold the speed."""
         del key
-        egos, slot = state.egos, state.egos.slot
-        wheelbase = state.shape.wheelbase[slot]
-        v, lane, goal = state.v[slot], state.lane[slot], state.goal[slot]
-        reach = jnp.maximum(self.look_ahead * v, 4.0)
-        # the point ahead along the route, up to two lanes on
-        there, s = lane, state.s[slot] - state.shape.length[slot] / 2 + reach
-        for _ in range(2):
-            after = lane_map.routes.next_lane[there, goal]
-            beyond = (s > lane_map.length[there]) & (after >= 0)
-            s = jnp.where(beyond, s - lane_map.length[there], s)
-            there = jnp.where(beyond, after, there)
-        x, y, _ = pose(lane_map, there, s)
-        cos, sin = jnp.cos(egos.heading), jnp.sin(egos.heading)
-        dx, dy = x - (egos.x - wheelbase / 2 * cos), y - (egos.y - wheelbase / 2 * sin)
-        across = cos * dy - sin * dx
-        bend = 2 * across / jnp.maximum(dx * dx + dy * dy, 1.0)
-        steering = jnp.arctan(wheelbase * bend)
-        wish = (memory - v) / config.decision_time
+        steering = steer_along(lane_map, state, self.look_ahead)
+        wish = (memory - state.v[state.egos.slot]) / config.decision_time
         return Command(control=Control(acceleration=wish, steering=steering)), memory
+
+
+def steer_along(lane_map: LaneMap, state: State, look_ahead: float = 0.8) -> Float[Array, " E"]:
+    """Steering (rad) of egos along their routes by pure pursuit.
+
+    Args:
+      lane_map: the map.
+      state: the world now.
+      look_ahead: s to the point of the lane that is pursued.
+    """
+    egos, slot = state.egos, state.egos.slot
+    wheelbase = state.shape.wheelbase[slot]
+    v, lane, goal = state.v[slot], state.lane[slot], state.goal[slot]
+    reach = jnp.maximum(look_ahead * v, 4.0)
+    # the point ahead along the route, up to two lanes on
+    there, s = lane, state.s[slot] - state.shape.length[slot] / 2 + reach
+    for _ in range(2):
+        after = lane_map.routes.next_lane[there, goal]
+        beyond = (s > lane_map.length[there]) & (after >= 0)
+        s = jnp.where(beyond, s - lane_map.length[there], s)
+        there = jnp.where(beyond, after, there)
+    x, y, _ = pose(lane_map, there, s)
+    cos, sin = jnp.cos(egos.heading), jnp.sin(egos.heading)
+    dx, dy = x - (egos.x - wheelbase / 2 * cos), y - (egos.y - wheelbase / 2 * sin)
+    across = cos * dy - sin * dx
+    bend = 2 * across / jnp.maximum(dx * dx + dy * dy, 1.0)
+    return jnp.arctan(wheelbase * bend)
 
 
 @dataclass(frozen=True)

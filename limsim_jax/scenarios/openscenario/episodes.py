@@ -98,7 +98,7 @@ class ScenarioEpisodes(Episodes):
       chunk: worlds per call.
       horizon: s.
       dt: s, physics step.
-      decision_every: physics steps per decision.
+      decision_every: physics steps per decision; None: as the policy needs, otherwise 5.
       controlled: the policy drives from the start, even if the scenario activates it later or never.
       asked: how many variants of the file, on all maps; None: all.
     """
@@ -114,20 +114,24 @@ class ScenarioEpisodes(Episodes):
         chunk: int | None = None,
         horizon: float = HORIZON,
         dt: float = 0.1,
-        decision_every: int = 5,
+        decision_every: int | None = None,
         controlled: bool = False,
         asked: int | None = None,
     ) -> None:
         self.source, self.which, self.town = scenario, list(which), town
         self.scenario, self._asked = name, asked
         named = isinstance(policy, str)
-        self.experiment = ExperimentFile(
-            name=name, map=town.source, horizon=horizon, dt=dt, decision_every=decision_every, slots=64,
+        run = ExperimentFile(
+            name=name, map=town.source, horizon=horizon, dt=dt, slots=64,
             ego=(EgoTable(policy=policy if named else "like_traffic"),),
         )  # fmt: skip
         value = None if named else policy
         self._values = {"policy": value, "drivers": None, "model": None, "metrics": ()}
-        self._policy: PolicyLike = policy_of(self.experiment) if value is None else value
+        self._policy: PolicyLike = policy_of(run) if value is None else value
+        needs = getattr(self._policy, "decision_time", None)
+        every = 5 if needs is None else max(1, round(needs / dt))
+        every = every if decision_every is None else decision_every
+        self.experiment = run.model_copy(update={"decision_every": every})
         self.policy = _SCRIPT if policy is None else self.experiment.policy if named else policy_name(policy)
         self._script_only, self._controlled = policy is None, controlled
         self.roads = Roads(town)
@@ -137,7 +141,7 @@ class ScenarioEpisodes(Episodes):
         self._code = None
         self.sizes = self._sizes(dt)
         self.units = self._all_units()
-        config = Config(dt=dt, decision_every=decision_every)
+        config = Config(dt=dt, decision_every=every)
         self.rollout = Rollout(config, Traffic(player=Play()), horizon, self._policy, measure=self._measure)
         self.world_bytes = 0
         self.worlds = Worlds(
