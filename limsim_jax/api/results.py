@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from limsim_jax.policies.language.store import Answer
     from limsim_jax.report.compare import Comparison
     from limsim_jax.report.tables import TextTable
+    from limsim_jax.scenarios.openscenario.outcome import Tally
     from limsim_jax.sweeps.episode import Episodes
 
 """(scenario, policy) to a function that makes their worlds again."""
@@ -118,6 +119,16 @@ class Results:
             if name not in results.policies:
                 raise ValueError(f"compare: no policy '{name}'; there are {results._policies()}")
         return compare(self.stored, None if other is None else other.stored, policies=(a, b or a))
+
+    def outcome(self) -> list[Tally]:
+        """How many variants of each scenario file passed and collided, by policy.
+
+        `preventable`: collisions that the careful driver of UN R157 avoids, where `r157_careful` was run on
+        the same variants. Results of other experiments have none.
+        """
+        from limsim_jax.scenarios.openscenario.outcome import outcome
+
+        return outcome(self.stored)
 
     @property
     def policies(self) -> list[str]:

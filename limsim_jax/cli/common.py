@@ -19,8 +19,16 @@ JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help=
 NoCacheOption = Annotated[bool, typer.Option("--no-cache", help="Read the map file itself; leave no trace.")]
 
 
-def table(lines: Sequence[Sequence[str]], title: str | None = None, head: Sequence[str] = ()) -> None:
-    """Print rows of cells, such as names and values."""
+def table(
+    lines: Sequence[Sequence[str]],
+    title: str | None = None,
+    head: Sequence[str] = (),
+    *,
+    wide: bool = False,
+) -> None:
+    """Print rows of cells, such as names and values.
+
+    `wide`: a line each, even if it is longer than 80 letters; not on a terminal."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -29,6 +37,8 @@ def table(lines: Sequence[Sequence[str]], title: str | None = None, head: Sequen
     for cells in lines:
         table.add_row(*(Text(cell) for cell in cells))
     console = Console()
+    if wide and not console.is_terminal:
+        console.width = 200
     if title is not None:
         console.print(Text(title, style="bold"))
     console.print(table)

@@ -126,6 +126,13 @@ def sweep(
         bool,
         typer.Option("--at-once", help="Of a .xosc: the policy drives from the start."),
     ] = False,
+    preventable: Annotated[
+        bool,
+        typer.Option(
+            "--preventable",
+            help="Of a .xosc: run the careful driver of UN R157, too; count what collisions it avoids.",
+        ),
+    ] = False,
     drivers: Annotated[
         Literal["sumo", "ours"] | None,
         typer.Option(help="With SUMO: what drives the other vehicles.  [default: sumo]"),
@@ -192,9 +199,11 @@ def sweep(
         sweep_scenarios(
             Path(experiment), policy, out=out, variants=seeds, override=map_file, chunk=chunk, shard=part,
             on_error=on_error, fresh=fresh, horizon=horizon, root=root, lenient=lenient, controlled=at_once,
+            preventable=preventable,
         )  # fmt: skip
         return
-    for name, value in {"--root": root, "--lenient": lenient, "--at-once": at_once}.items():
+    only = {"--root": root, "--lenient": lenient, "--at-once": at_once, "--preventable": preventable}
+    for name, value in only.items():
         if value:
             raise typer.BadParameter("only of a .xosc", param_hint=name)
     seeds = 100 if seeds is None else seeds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -88,12 +89,16 @@ def sweep_scenarios(
     root: Path | None,
     lenient: bool,
     controlled: bool,
+    preventable: bool,
 ) -> None:
-    """Run all variants of a scenario, or of those in a folder."""
+    """Run all variants of a scenario, or of those in a folder.
+
+    `preventable`: also under the careful driver of UN R157."""
     import time
 
     from limsim_jax.api.progress import progress_bar
     from limsim_jax.scenarios.openscenario.episodes import HORIZON, episodes_of
+    from limsim_jax.scenarios.openscenario.outcome import CAREFUL
     from limsim_jax.scenarios.openscenario.scenario import openscenario
     from limsim_jax.sweeps import runner
     from limsim_jax.xla import use_all_cores
@@ -103,13 +108,15 @@ def sweep_scenarios(
     if not 0 < length < 1e5:
         raise typer.BadParameter(f"{length:g} s; it has to be above 0", param_hint="--horizon")
     driver = None if policy == "script" else policy
+    drivers = [driver, CAREFUL] if preventable and driver != CAREFUL else [driver]
     options: dict[str, Any] = {"horizon": length, "chunk": chunk, "controlled": controlled}
     made = []
     for file in files_of(path):
         found = openscenario(file, lenient=lenient, root=root)
         for note in found.notes:
             print(f"{found.name}: {note}")
-        made += episodes_of(found, driver, override=override, variants=variants, **options)
+        for one in drivers:
+            made += episodes_of(found, one, override=override, variants=variants, **options)
     folder = Path("results") / path.stem if out is None else out
     begin, ran = time.perf_counter(), 0
     with progress_bar() as show:
@@ -131,19 +138,14 @@ def sweep_scenarios(
 
 def print_outcome(folder: Path) -> None:
     """Print how the variants of each scenario ended."""
-    import numpy as np
-
+    from limsim_jax.scenarios.openscenario.outcome import CAREFUL, outcome, totals
     from limsim_jax.sweeps.store import open_results
 
-    opened = open_results(folder)
-    lines = []
-    for scenario, policy in opened.provenance:
-        rows = opened.episodes
-        mine = np.asarray(rows.column("scenario")) == scenario
-        mine &= np.asarray(rows.column("policy")) == policy
-        if "passed" not in rows.column_names:
-            continue
-        passed, contacts = (np.asarray(rows.column(x))[mine] for x in ("passed", "contacts"))
-        said = f"{int(passed.sum())} of {len(passed)} passed, {int((contacts > 0).sum())} collided"
-        lines.append((f"{scenario} / {policy}", said))
-    table(lines)
+    found = outcome(open_results(folder))
+    if len({x.scenario for x in found}) > 1:
+        found += totals(found)
+    lines = [["" if x is None else str(x) for x in row] for row in found]
+    table(lines, head=("scenario", "policy", "variants", "passed", "collided", "preventable"), wide=True)
+    if any(x.preventable is not None for x in found):
+        print(f"preventable: collisions in variants in which {CAREFUL} has none")
+    print(f"where variants pass, and the worst of them: limsim-jax report {shlex.quote(str(folder))}")

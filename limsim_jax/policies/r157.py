@@ -46,6 +46,7 @@ _MILD = 2.0  # m/s^2, acceleration and braking without danger (esmini)
 _FIRM = 4.0  # m/s^2, hardest braking without danger (esmini)
 _AT_ONCE = 1e3  # m/s^3
 _LIMITS = Limits()
+_ABOVE = ("comfortable", "hardest", "leader", "deceleration", "lateral", "jerk", "range")
 
 WANDERING = 0.375
 """m sideways that a vehicle in the middle of its lane may move (R157)."""
@@ -107,7 +108,11 @@ class Reference(Policy):
     def __post_init__(self) -> None:
         for one in fields(self):
             value = getattr(self, one.name)
-            if isinstance(value, float) and not value >= 0:
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                continue
+            if one.name in _ABOVE and not value > 0:
+                raise ValueError(f"{one.name}: {value}; expected more than 0")
+            if not value >= 0:
                 raise ValueError(f"{one.name}: {value}; expected 0 or more")
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Memory:
@@ -377,7 +382,7 @@ class FuzzyDriver(Reference):
         stop = v * self.reaction - lead * lead / (2 * self.leader)
         unsafe = stop + v * v / (2 * self.hardest)
         safe = stop + v * v / (2 * self.comfortable) + self.margin
-        return jnp.clip((safe - (gap - self.margin)) / (safe - unsafe), 0, 1)
+        return jnp.clip((safe - (gap - self.margin)) / jnp.maximum(safe - unsafe, 1e-3), 0, 1)
 
     def critical(
         self,

@@ -311,5 +311,7 @@ def test_the_critical_measure_is_between_two_brakings(v, lead, a):
 def test_numbers_that_make_no_sense():
     with pytest.raises(ValueError, match=r"reaction: -1.0; expected 0 or more"):
         CarefulDriver(reaction=-1.0)
-    with pytest.raises(ValueError, match=r"range: nan; expected 0 or more"):
+    with pytest.raises(ValueError, match=r"range: nan; expected more than 0"):
         RssDriver(range=float("nan"))
+    with pytest.raises(ValueError, match=r"comfortable: 0; expected more than 0"):
+        FuzzyDriver(comfortable=0)

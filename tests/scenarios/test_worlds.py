@@ -7,6 +7,7 @@ import pytest
 import xosc
 from osc_worlds import play, road
 
+from limsim_jax import cli
 from limsim_jax.api import results as stored
 from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.scenarios.openscenario.episodes import episodes_of, rebuild
@@ -79,6 +80,25 @@ def test_variants_are_worlds_of_a_sweep(tmp_path):
     v = np.asarray(trace.v)[0, :, 0]
     np.testing.assert_allclose(v[:19], 20, atol=1e-4)
     assert v[120] < 15  # it brakes for B, which is slower
+
+
+@pytest.mark.engine
+def test_a_sweep_tells_what_is_preventable(tmp_path, capsys):
+    path = cut_in(tmp_path)[1]
+    path.write_text(path.read_text().replace('"40"', '"50"'))
+    options = "--policy constant_speed --preventable --horizon 10 --at-once --chunk 3".split()
+    assert cli.main(["sweep", str(path), *options, "--out", str(tmp_path / "found")]) == 0
+    lines = [x.split() for x in capsys.readouterr().out.splitlines()]
+    rows = open_results(tmp_path / "found").episodes.to_pylist()
+    hit = {(x["policy"], x["parameter_gap"]): x["contacts"] > 0 for x in rows}
+    assert hit["constant_speed", 50] and not hit["r157_careful", 50]
+    assert not hit["constant_speed", 500] and not hit["r157_careful", 500]
+    prevented = 1 + (hit["constant_speed", 8] and not hit["r157_careful", 8])
+    for policy, preventable in (("constant_speed", prevented), ("r157_careful", 0)):
+        collided = sum(hit[policy, gap] for gap in (8, 50, 500))
+        assert ["cuts", policy, "3", str(3 - collided), str(collided), str(preventable)] in lines
+    made = episodes_of(openscenario(path), "r157_careful", dt=0.05)[0]
+    assert made.rollout.config.decision_every == made.experiment.decision_every == 2
 
 
 @pytest.mark.parametrize(("policy", "name"), [(None, "script"), ("pdm_closed", "pdm_closed")])
