@@ -5,9 +5,10 @@ In this order:
 1. what happened, and the worst crash;
 2. the main metrics with intervals;
 3. the worst seeds, each with pictures of its key moment, the responsible party, and its replay;
-4. episodes without success by cause, key moments by kind;
-5. metrics by scenario, where there are several columns;
-6. distributions, all metrics, provenance.
+4. of scenario files, where variants pass in the space of parameters;
+5. episodes without success by cause, key moments by kind;
+6. metrics by scenario, where there are several columns;
+7. distributions, all metrics, provenance.
 
 The text stands in `page.html.j2`, which escapes every value.
 """
@@ -32,6 +33,7 @@ from limsim_jax.metrics.catalog import catalog, describe
 from limsim_jax.metrics.description import SECTIONS
 from limsim_jax.report.formats import estimate_text, number, with_bounds
 from limsim_jax.report.page import charts
+from limsim_jax.report.page.boundary import boundary
 from limsim_jax.report.page.content import (
     Key,
     Names,
@@ -133,6 +135,7 @@ def write_report(
         listed=[worst_row(row, replays.get(key_of(row)), names) for row in listed],
         failures=failures(parts, replays),
         command=names.command(("SCENARIO", "POLICY"), "N"),
+        boundary=boundary(results, parts, names, replays),
         moments=moments(results, parts),
         parties=responsible_counts(results, parts, names),
         scenarios=_by_scenario(parts, found, names) if len(parts) > 1 else [],
