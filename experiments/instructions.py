@@ -136,7 +136,7 @@ def table(rows: list[dict[str, Any]], seeds: int) -> str:
         "| group | instructions | understood | accepted | shown in 80 % of the worlds |",
         "|---|---:|---:|---:|---:|",
     ]
-    for kind, name in ("work", "known to the grammar's authors"), ("apart", "kept apart"):
+    for kind, name in ("work", "written with the grammar"), ("apart", "written apart"):
         some = [row for row in rows if row["kind"] == kind]
         shown = sum(row["loaded"] and row["shown"] >= 0.8 for row in some)
         counts = [

@@ -7,7 +7,6 @@ time is shared out beforehand; within it training goes on for as long as there i
 
 from __future__ import annotations
 
-import itertools
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -45,8 +44,8 @@ FIRST_SEED = 2_000_000
 HELD_OUT = 11
 """Of eleven segments one is held out, with all its worlds: with five scenarios, each in its turn."""
 
-KEPT = 40_000
-"""Samples that are kept at most, 0.9 GB; of more, old ones are replaced at random."""
+KEPT = 60_000
+"""Samples that are kept at most, 1.4 GB; of more, old ones are replaced at random."""
 
 BATCH = 256
 """Samples per step."""
@@ -64,7 +63,7 @@ WEIGHTS = {"path": 1.0, "speed": 1.0, "waypoints": 0.3, "density": 0.5, "rules":
 """What parts of the loss count."""
 
 _SHARES = {"clone": 0.45, "round": 0.55}  # of the time that is left after compiling
-_COLLECTS = 0.45  # share of a phase in which samples are collected
+_COLLECTS = 0.35  # share of a phase in which samples are collected
 _LOOK_EVERY, _LOOK_AT = 100, 1024  # steps, and held-out samples that are looked at
 
 
@@ -165,7 +164,7 @@ def importance(labels: Labels, ego: Float[np.ndarray, "S 9"]) -> Float[np.ndarra
     change = np.asarray(labels.change)
     red = np.asarray(labels.rules)[:, RULES.index("red light")]
     aside = np.abs(np.asarray(labels.path)[:, -1]) > 1.0
-    return 1.0 + 2.0 * (np.abs(change) > 1.0) + 2.0 * (stands & (change > 0.3)) + 2.0 * red + 2.0 * aside
+    return 1.0 + 2.0 * (np.abs(change) > 1.0) + 3.0 * (stands & (change > 0.3)) + 2.0 * red + 4.0 * aside
 
 
 # --- training ----------------------------------------------------------------------------------------
@@ -337,7 +336,7 @@ class _Training:
         self.rng = np.random.default_rng(seed + 1)
         self.curve: list[dict[str, Any]] = []
         self.steps = 0
-        self._turn = itertools.cycle(self.fields)
+        self._turns = [0] * len(scenarios)
 
     @property
     def elapsed(self) -> float:
@@ -382,7 +381,7 @@ class _Training:
         """Collect, then learn, within some time."""
         began = self.elapsed
         while self.elapsed - began < seconds * _COLLECTS or not self._enough():
-            field = next(self._turn)
+            field = self._next()
             weights = self.learner.best[1]
             self.store.add(field.scenario, field.segment(weights, lead, self.rng))
         told = ", ".join(f"{name} {count:,}" for name, count in self.store.counts.items())
@@ -398,6 +397,13 @@ class _Training:
                 rest = ", ".join(f"{part} {x:.3f}" for part, x in parts.items())
                 self.tell(f"{name}: step {self.steps}, loss {value:.3f}; held out: {rest}")
         save_weights(self.out, self._trained())
+
+    def _next(self) -> Field:
+        """The scenario whose turn it is: long ones more often, by the root of their length."""
+        turns = [n / field.segments**0.5 for n, field in zip(self._turns, self.fields, strict=True)]
+        k = int(np.argmin(turns))
+        self._turns[k] += 1
+        return self.fields[k]
 
     def _enough(self) -> bool:
         """Whether there are samples of every scenario, held-out ones among them."""

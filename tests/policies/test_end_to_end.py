@@ -262,6 +262,11 @@ def test_a_follower_does_not_hold_the_ego():
     # from the right, across the path ahead of the ego: it counts
     across = free_distances(way, objects_of(density_with((8.0, -8.0, np.pi / 2, 4.0, 2.0, 8.0))), *size)
     assert np.asarray(across)[0, 2] < 8.0
+    # a fast one on the lane beside, as a density map has its heading: it stays there
+    beside = density_with((-6.0, -3.5, 0.15, 4.0, 2.0, 30.0), (-6.0, 3.5, -0.15, 4.0, 2.0, 25.0))
+    assert (np.asarray(free_distances(way, objects_of(beside), *size)) > 500).all()
+    turns = free_distances(way, objects_of(density_with((6.0, -5.0, 0.4, 4.0, 2.0, 10.0))), *size)
+    assert np.asarray(turns)[0, 2:].min() < 30.0
     # into the side of the ego: it does not, from then on
     into = free_distances(way, objects_of(density_with((0.0, -8.0, np.pi / 2, 4.0, 2.0, 8.0))), *size)
     assert (np.asarray(into)[0, 2:] > 500).all()
