@@ -42,7 +42,7 @@ from limsim_jax.xla import enable_compilation_cache, use_all_cores
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
 SHARED = Path(os.environ.get("LIMSIM_SHARED_DATA", HERE.parents[1] / "shared" / "data"))
-HELD_OUT = ("carla_town01", "carla_town02")
+HELD_OUT = ("carla_town01", "carla_town03")
 """Maps that no network was trained on, under the bundled experiment `town`."""
 
 FAULTS = Faults(drop_rate=0.01, freeze_rate=0.01, position_drift=0.05, yaw_drift=0.0035)

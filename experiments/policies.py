@@ -27,7 +27,6 @@ from limsim_jax.bench import bench_policy
 from limsim_jax.files import write_whole
 from limsim_jax.policies import POLICIES as KNOWN
 from limsim_jax.policies.base import build_policy, knows
-from limsim_jax.policies.end_to_end.policy import WEIGHTS
 from limsim_jax.statistics import bootstrap, wilson
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import read_experiments
@@ -39,8 +38,7 @@ HERE = Path(__file__).parent
 RESULTS = HERE / "results"
 POLICIES = (
     "like_traffic", "pdm_closed", "pdm_closed_rules", "pdm_hybrid", "limsim_tm", "limsim_tm_privileged",
-    "area_of_interest",
-    *(("end_to_end",) if WEIGHTS.exists() else ()),
+    "area_of_interest", "end_to_end",
 )  # fmt: skip
 SEEDS = dict.fromkeys(PAPER, 1000) | {"long_route": 300}
 OWN = ("own_policies:Cautious", "own_policies:follower")

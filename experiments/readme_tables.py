@@ -396,10 +396,6 @@ TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
 }
 
 
-LATER = ("end_to_end",)
-"""Tables whose result may not be there yet: it needs weights that a version may come without."""
-
-
 def success(result: dict[str, Any]) -> str:
     """For the README: policies down, scenarios across, the share of successes with its interval."""
     rows = result["rows"]
@@ -422,9 +418,7 @@ README: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {"success": ("p
 def places() -> dict[Path, dict[str, str]]:
     """The tables of every page, by the name of their place."""
     found = {
-        REPO / "docs" / "results" / f"{name}.md": {name: table(read(name))}
-        for name, table in TABLES.items()
-        if name not in LATER or _file(name).exists()
+        REPO / "docs" / "results" / f"{name}.md": {name: table(read(name))} for name, table in TABLES.items()
     }
     found[REPO / "README.md"] = {name: table(read(result)) for name, (result, table) in README.items()}
     return found

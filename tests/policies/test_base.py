@@ -25,7 +25,6 @@ from limsim_jax.policies.base import (
     renew_rows,
     with_scenery,
 )
-from limsim_jax.policies.end_to_end.policy import WEIGHTS
 from limsim_jax.policies.host import HostPolicy
 from limsim_jax.policies.limsim_tm import LimSimTM
 from limsim_jax.policies.pdm import PDMClosed
@@ -111,8 +110,7 @@ def test_an_undecorated_class_can_set_attributes_and_is_equal_to_itself_alone():
 
 @pytest.mark.parametrize(
     ("name", "factory"),
-    # one needs a server; one has weights in some versions only
-    [x for x in POLICIES.items() if x[0] != "language" and (x[0] != "end_to_end" or WEIGHTS.exists())],
+    [x for x in POLICIES.items() if x[0] != "language"],  # that one needs a server
 )
 def test_registered_policies_have_the_names_of_the_registry(name, factory):
     assert policy_name(factory()) == name

@@ -13,7 +13,6 @@ from traffic_worlds import bundled, motorway, state_of
 from limsim_jax.maps.scenery import TILE, Scenery
 from limsim_jax.policies.base import check_policy, knows, needs_scenery
 from limsim_jax.policies.end_to_end import EndToEnd, ObserveSensors, network
-from limsim_jax.policies.end_to_end import policy as policy_module
 from limsim_jax.policies.end_to_end.control import (
     BRAKING,
     MARGIN,
@@ -46,11 +45,13 @@ from limsim_jax.policies.end_to_end.network import (
     target_speed,
     two_hot,
 )
+from limsim_jax.policies.end_to_end.policy import WEIGHTS
 from limsim_jax.policies.host import HostPolicy
 from limsim_jax.sensors.faults import Faults
 from limsim_jax.sensors.rig import LAYERS_1, Camera, Rig, six_cameras
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.motion import boxes
+from limsim_jax.training.hybrid import SCENARIOS
 from limsim_jax.types import Config
 
 CONFIG = Config(dt=0.1)
@@ -348,9 +349,16 @@ def test_bad_weights_are_refused_in_one_line(tmp_path):
     refused("less.npz: .* is missing", weights=str(tmp_path / "less.npz"))
 
 
-def test_without_weights_it_says_how_to_make_them(monkeypatch, tmp_path):
-    monkeypatch.setattr(policy_module, "WEIGHTS", tmp_path / "none.npz")
-    refused("weights: none come with this version; `limsim-jax train end-to-end`")
+def test_the_weights_of_the_package_have_a_card():
+    assert WEIGHTS.stat().st_size < 1e6
+    trained = EndToEnd().trained
+    assert trained.design == Design()
+    about = trained.about
+    assert set(about["seeds"]) == set(about["samples"]) == set(SCENARIOS)
+    assert all(first >= 2_000_000 for first, _ in about["seeds"].values())
+    assert about["seconds"] < 20 * 60 and len(about["source"]) == 16
+    first, last = about["curve"][0], about["curve"][-1]
+    assert last["loss"] < first["loss"]
 
 
 def test_planners_on_the_host_may_have_the_same_sensors():

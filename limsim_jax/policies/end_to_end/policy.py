@@ -139,10 +139,6 @@ class EndToEnd(Policy):
     def _network(self) -> Trained:
         if self.network is not None:
             return self.network
-        if self.weights is None and not WEIGHTS.exists():
-            raise ValueError(
-                "weights: none come with this version; `limsim-jax train end-to-end` makes a file of them"
-            )
         return load_weights(str(WEIGHTS) if self.weights is None else self.weights)
 
     def init(self, config: Config, lane_map: LaneMap, state: State) -> Memory:
