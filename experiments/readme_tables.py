@@ -324,8 +324,10 @@ def end_to_end(result: dict[str, Any]) -> str:
         "| contact at fault, % | off the road, % |",
         "|---|---|---:|---|---:|---|---:|---:|",
     ]
-    for r in result["rows"]:
-        (success, low, high), (score, least, most) = ([100 * x for x in r[k]] for k in ("success", "score"))
+    order = {name: k for k, name in enumerate(PAPER)}
+    for r in sorted(result["rows"], key=lambda r: order.get(r["scenario"], len(order))):
+        success, low, high = (100 * x for x in r["success"])
+        score, least, most = r["score"]
         where = f"{r['scenario']}, held out" if r["held_out"] else r["scenario"]
         theirs = INTERFUSER.get(r["scenario"]) if r["driver"] == "end-to-end" else None
         rows.append(
