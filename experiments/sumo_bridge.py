@@ -46,7 +46,6 @@ FULL = (
     "bologna_pasubio",
     "limsim_roundabout",
     "limsim_bigInter",
-    "limsim_town01",
     "limsim_town05",
 )
 COLUMNS = ("success", "nuplan_score", "at_fault_contacts", "completion", "mean_speed", "sumo_collisions")
