@@ -81,8 +81,10 @@ def chat(
     for name in names:
         if name not in (*known, "camera"):
             raise typer.BadParameter(f"'{name}'; known are {', '.join(known)}, camera", param_hint="--model")
-    if ("camera" in names) != (weights is not None):
-        raise typer.BadParameter("goes with --model camera, and that with it", param_hint="--weights")
+    if "camera" in names and weights is None:
+        raise typer.BadParameter("none; a file goes with --model camera", param_hint="--weights")
+    if "camera" not in names and weights is not None:
+        raise typer.BadParameter("only goes with --model camera", param_hint="--weights")
     if weights is not None:
         from limsim_jax.bridges.chat.camera import Camera
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from limsim_jax.geometry import boxes_overlap
+from limsim_jax.geometry import boxes_overlap, wrap_angle
 from limsim_jax.policies.end_to_end.network import (
     CELL,
     DENSITY,
@@ -241,14 +241,13 @@ def free_distances(
     ) -> Array:
         zero, one = jnp.zeros_like(length), jnp.ones_like(x)
         near = jnp.argmin(jnp.square(o.x[:, None] - x[None]) + jnp.square(o.y[:, None] - y[None]), -1)
-        turned = o.heading - heading[near]
-        turned = jnp.arctan2(jnp.sin(turned), jnp.cos(turned))
-        way = jnp.where(jnp.abs(turned) < ALONG, heading[near], o.heading)
+        turned = wrap_angle(o.heading - heading[near])
+        course = jnp.where(jnp.abs(turned) < ALONG, heading[near], o.heading)
         at = jnp.stack([x, y, heading, length * one, (width + WIDER) * one], -1)  # [P 5]
         body = jnp.stack([zero, zero, zero, length, width])
-        ox = o.x[None] + time[:, None] * (o.v * jnp.cos(way))[None]  # [M K]
-        oy = o.y[None] + time[:, None] * (o.v * jnp.sin(way))[None]
-        rest = (jnp.broadcast_to(z[None], ox.shape) for z in (way, o.length, o.width))
+        ox = o.x[None] + time[:, None] * (o.v * jnp.cos(course))[None]  # [M K]
+        oy = o.y[None] + time[:, None] * (o.v * jnp.sin(course))[None]
+        rest = (jnp.broadcast_to(z[None], ox.shape) for z in (course, o.length, o.width))
         box = jnp.stack([ox, oy, *rest], -1)  # [M K 5]
         hit = jax.vmap(lambda a: jax.vmap(jax.vmap(lambda b: boxes_overlap(a, b)))(box))(at)  # [P M K]
         inside = jax.vmap(jax.vmap(lambda b: boxes_overlap(body, b)))(box)  # [M K]
