@@ -65,7 +65,7 @@ def test_variants_are_worlds_of_a_sweep(tmp_path):
     rows = results.episodes.to_pydict()
     assert rows["parameter_gap"] == [8, 40, 500]
     assert rows["scenario_ended"] == [1, 1, 1]
-    assert rows["passed"][1:] == [1, 1]
+    assert rows["passed"][1:] == [1, 1] and rows["success"] == rows["passed"]
     with pytest.raises(ResultsError, match="was made with policy from Python"):
         stored.rebuild(results, *next(iter(results.provenance)))
 

@@ -241,6 +241,7 @@ class ScenarioEpisodes(Episodes):
             np.nan_to_num(found[x]) > 0 for x in ("contacts", "off_road", "policy_failed") if x in found
         )
         found[PASSED] = (np.asarray(bad) == 0).astype(float)
+        found["success"] = found[PASSED]  # a scenario file has no destination to arrive at
         found |= self._parameter_columns(seeds)
         return {name: found[name] for name in self.units}
 
