@@ -42,6 +42,9 @@ TILE = 64
 
 _BITS = TILE.bit_length() - 1
 
+_LEAST_TILES = 192, 48
+"""Columns and rows of the table of tiles at least, 3 km by 768 m: maps of like size share programs."""
+
 MARK_WIDTH = 0.15
 """Lane marks, m (RMS 1993: 0.12 to 0.15); at least a pixel is painted."""
 
@@ -335,7 +338,8 @@ class _Canvas:
         """
         where = np.array(list(self.painted)).reshape(-1, 2)
         low = where.min(0) - 1
-        columns, rows = (bucket(int(n), 8) for n in where.max(0) + 2 - low)
+        size = zip(where.max(0) + 2 - low, _LEAST_TILES, strict=True)
+        columns, rows = (bucket(int(n), least) for n, least in size)
         table = np.zeros((rows, columns), np.int32)
         table[where[:, 1] - low[1], where[:, 0] - low[0]] = np.arange(1, len(where) + 1)
         paint = np.full((bucket(len(where) + 1, 256), TILE, TILE), Label.TERRAIN, np.uint8)

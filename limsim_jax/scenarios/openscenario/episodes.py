@@ -32,8 +32,9 @@ from limsim_jax.simulation.trace import trace
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.sweeps.answers import Notes
 from limsim_jax.sweeps.build import policy_of
-from limsim_jax.sweeps.episode import Episodes, provenance_of
+from limsim_jax.sweeps.episode import Episodes, provenance_of, source_hash
 from limsim_jax.sweeps.experiment import EgoTable, ExperimentFile, name_of
+from limsim_jax.sweeps.identity import describe_program
 from limsim_jax.sweeps.reruns import CanBrake
 from limsim_jax.traffic.demand.draws import Layout
 from limsim_jax.traffic.engine import Traffic
@@ -144,9 +145,14 @@ class ScenarioEpisodes(Episodes):
         config = Config(dt=dt, decision_every=every)
         self.rollout = Rollout(config, Traffic(player=Play()), horizon, self._policy, measure=self._measure)
         self.world_bytes = 0
+        watched, source = replace(self.rollout, record=trace, policy=CanBrake(self._policy)), source_hash()
+        names = (
+            describe_program(source, "variants", *self.sizes),
+            describe_program(source, replace(watched, horizon=1.0)),  # programs run for any time
+        )
         self.worlds = Worlds(
-            replace(self.rollout, record=trace, policy=CanBrake(self._policy)),
-            self.lane_map, lambda world: world, given=lambda seeds: (self.worlds_of(seeds.tolist()), seeds),
+            watched, self.lane_map, lambda world: world, names=names,
+            given=lambda seeds: (self.worlds_of(seeds.tolist()), seeds),
             chunk=min(_CHUNK, max(len(self.which), 1)) if chunk is None else chunk,
         )  # fmt: skip
         self.chunk = self.worlds.chunk

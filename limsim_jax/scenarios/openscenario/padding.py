@@ -13,22 +13,25 @@ from limsim_jax.scenarios.openscenario.roads import Corridor
 
 
 class Sizes(NamedTuple):
-    """Lengths of padded axes. Scenarios of equal sizes share a program."""
+    """Lengths of padded axes. Scenarios of equal sizes share a program.
 
-    entities: int = 3
+    The least sizes hold all public scenarios of UN R157, so that all of them share one.
+    """
+
+    entities: int = 4
     corridors: int = 2
-    points: int = 128
+    points: int = 768
     places: int = 2
     trajectories: int = 1
     vertices: int = 2
     actions: int = 6
     profile: int = 3
-    elements: int = 16
+    elements: int = 24
     conditions: int = 8
     groups: int = 8
     triggers: int = 8
-    values: int = 4
-    ring: int = 0
+    values: int = 12
+    ring: int = 256
 
     def __or__(self, other: Sizes) -> Sizes:
         """Sizes that hold both."""
@@ -40,7 +43,10 @@ def sizes_of(*, points: int, delays: list[int], vertices: int, **counts: int) ->
     least = Sizes()
     rounded = {name: bucket(count, getattr(least, name)) for name, count in counts.items()}
     return Sizes(
-        points=128 * math.ceil(points / 128), ring=ring(delays), vertices=bucket(vertices, 2), **rounded
+        points=max(least.points, 128 * math.ceil(points / 128)),
+        ring=max(least.ring, 1 << max([0, *delays]).bit_length()),
+        vertices=bucket(vertices, least.vertices),
+        **rounded,
     )
 
 
@@ -70,11 +76,6 @@ NO_PLACE = {
     "turned": 0,
 }  # fmt: skip
 NO_ELEMENT = {"level": -1, "parent": -1, "start": -1, "stop": -1, "most": 1, "priority": 0}
-
-
-def ring(delays: list[int]) -> int:
-    """Steps that have to be kept: few sizes."""
-    return max(64, 1 << max([0, *delays]).bit_length())
 
 
 def padded(values: list[Any], count: int, fill: Any, kind: Any = None) -> Any:

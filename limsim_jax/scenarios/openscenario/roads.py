@@ -10,9 +10,9 @@ from __future__ import annotations
 import heapq
 import itertools
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,6 +41,7 @@ SIDE = 7
 ACROSS = math.radians(40)
 """Angle to its lane from which an entity moves straight on, not along the lane."""
 
+_TRIES = 3  # nearest points of a lane that point one way, from which its foot is searched
 _NEAR = 30.0  # m from a lane within which a place is on its corridor
 _STRAIGHT = 1000.0  # m of a corridor that is no road
 
@@ -84,6 +85,9 @@ class Roads:
 
     def __init__(self, town: Map) -> None:
         self.town, self.network = town, town.network
+        # variants of a scenario start in few places
+        self.nearest = lru_cache(4096)(self._nearest)
+        self._open_corridor = lru_cache(256)(self._made_corridor)
         self._lanes: dict[str, dict[int, list[Lane]]] = defaultdict(lambda: defaultdict(list))
         for lane in self.network.lanes.values():
             self._lanes[lane.road][lane.number].append(lane)
@@ -156,27 +160,31 @@ class Roads:
         return Pose(x, y, h)
 
     @cached_property
-    def _points(self) -> tuple[Floats, list[tuple[Lane, float]]]:
-        """Points of all lanes that carry motor traffic, about 5 m apart."""
+    def _points(self) -> tuple[Floats, list[tuple[Lane, float, float]]]:
+        """Points of all lanes that carry motor traffic, about 5 m apart: lane, m along it, its heading."""
         where, what = [], []
         for lane in self.network.lanes.values():
             if not lane.drivable:
                 continue
             places = np.linspace(0, lane.length, max(2, int(lane.length / 5) + 1))
-            xyz, _ = lane.pose(places)
+            xyz, heading = lane.pose(places)
             where.append(xyz[:, :2])
-            what += [(lane, float(s)) for s in places]
+            what += [(lane, float(s), float(h)) for s, h in zip(places, heading, strict=True)]
         return np.concatenate(where), what
 
-    def nearest(self, pose: Pose) -> Spot | None:
+    def _nearest(self, pose: Pose) -> Spot | None:
         """The lane on which a pose is: of those near, one that points the same way."""
         where, what = self._points
         away = np.hypot(where[:, 0] - pose.x, where[:, 1] - pose.y)
         best: tuple[float, Spot] | None = None
-        for k in np.argsort(away)[:64]:
-            if away[k] > _NEAR:
-                break
-            lane, s = what[k]
+        near = np.flatnonzero(away <= _NEAR)
+        seen: Counter[tuple[str, bool]] = Counter()
+        for k in near[np.argsort(away[near])]:
+            lane, s, h = what[k]
+            key = lane.id, math.cos(h - pose.h) > 0
+            if seen[key] == _TRIES:
+                continue
+            seen[key] += 1
             spot = foot(lane, s, pose)
             misfit = abs(spot.d) + 5 * max(-spot.s, spot.s - lane.length, 0.0)
             h = self.at(spot._replace(s=min(max(spot.s, 0.0), lane.length))).h
@@ -195,12 +203,17 @@ class Roads:
         """
         if spot is None:
             return straight(pose)
+        route = tuple(x.id for x in route)
+        return self._open_corridor(spot.lane.id, spot.s, spot.d, pose, route)
+
+    def _made_corridor(self, lane: str, s: float, d: float, pose: Pose, route: tuple[str, ...]) -> Corridor:
+        spot = Spot(self.network.lanes[lane], s, d)
         h = self.at(spot).h
         turned = abs(math.remainder(pose.h - h, 2 * math.pi))
         if ACROSS < turned < math.pi - ACROSS:
             return straight(pose)
         against = turned > math.pi / 2
-        chain, start = self._chain(spot, list(route), against)
+        chain, start = self._chain(spot, [self.network.lanes[x] for x in route], against)
         return self._points_of(chain, start, against)
 
     def _chain(self, spot: Spot, route: list[Lane], against: bool) -> tuple[list[Lane], float]:
