@@ -40,8 +40,8 @@ CHUNK = 50
 TIMES = "times.json"
 
 HEAD = (
-    "| scenario | policy | variants | passed | collided | preventable | ms per variant "
-    "| in all | h for all |",
+    "| scenario | policy | variants | passed | collided | preventable | CPU ms per variant "
+    "| in all | CPU h for all |",
     "|---|---|---:|---:|---:|---:|---:|---:|---:|",
 )
 
@@ -59,12 +59,12 @@ def run(one: ScenarioEpisodes, folder: Path) -> dict[str, float]:
     """Run those variants of a file on one map that are missing.
 
     Returns:
-      s to compile, s to run, and how many worlds; empty if all are on disk.
+      Processor time to compile and to run, s, and how many worlds; empty if all are on disk.
     """
     marks: dict[str, float] = {}
 
     def tell(now: runner.Progress) -> None:
-        marks.setdefault(now.stage, time.perf_counter())
+        marks.setdefault(now.stage, time.process_time())
 
     summary = runner.sweep([one], range(len(one.which)), folder, progress=tell)
     worlds = sum(x.ran for x in summary.parts)
@@ -99,7 +99,7 @@ def rows(results: Results, times: dict[str, dict[str, float]], files: Sequence[P
 
 
 def hours(row: dict[str, Any]) -> float:
-    """h for all variants of a file, with the time to compile."""
+    """Processor time for all variants of a file, h, compiling included."""
     each = row["seconds"] / row["worlds"] if row["worlds"] else 0.0
     return (each * row["all"] + row["compile"]) / 3600
 
@@ -120,7 +120,7 @@ def markdown(table: dict[str, Any]) -> str:
         count, passed, collided, prevented = (
             sum(row[x] for row in mine) for x in ("variants", "passed", "collided", "preventable")
         )
-        every = f"all {sum(row['all'] for row in mine):,} in {sum(map(hours, mine)):.1f} h"
+        every = f"all {sum(row['all'] for row in mine):,} in {sum(map(hours, mine)):.1f} CPU h"
         lines.append(
             f"- {policy}: files {len(mine)}, {passed:,} of {count:,} variants passed, {collided:,} collided, "
             f"{prevented:,} of these preventable"

@@ -44,9 +44,7 @@ def straight(folder: Path) -> Roads:
     return Roads(load_map(path, cache=False))
 
 
-SIZES = Sizes(
-    corridors=4, points=512, places=4, vertices=128, actions=8, profile=4, elements=24, conditions=8, ring=64
-)  # fmt: skip
+SIZES = Sizes(corridors=4, places=4, vertices=128, actions=8, profile=4)
 """Of all scenarios of these tests, so that one program serves them."""
 
 PIECE = 40
