@@ -11,13 +11,9 @@ a policy draws hangs on the array, too, so an array is a world that can be run a
 
 from __future__ import annotations
 
-import hashlib
 import io
-import json
-import shutil
 import time
-import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -29,18 +25,15 @@ from limsim_jax.files import write_whole
 from limsim_jax.rare_events.estimate import LEAST_SAMPLES, RUNS, RareEvent, check_settings, rare_event
 from limsim_jax.rare_events.samplers import LEVEL
 from limsim_jax.statistics import Interval
+from limsim_jax.sweeps.asked import Asked, Log, Tell
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.events import Event, event_of
-from limsim_jax.sweeps.numbered import Numbered, lane_of
-from limsim_jax.sweeps.store import NOT_COMPARED, ResultsError
+from limsim_jax.sweeps.numbered import names_of
 
 Method = Literal["subset", "crude", "cross-entropy"]
 
 LEAST = 1e-4
 """Probability per episode below which an event is not followed, unless told."""
-
-Tell = Callable[[int, int], None]
-"""Is told how many worlds have run, and how many will at most."""
 
 
 def worlds_per_level(worlds: int, method: Method, least: float, runs: int = RUNS) -> int:
@@ -202,120 +195,6 @@ def _shift_said(shift: Shift) -> str:
     return f"{shift.what}: {abs(shift.mean.estimate):.1f} [{low:.1f}, {high:.1f}] standard deviations {word}"
 
 
-class _Log:
-    """Metrics of batches on disk, in the order of their calls."""
-
-    def __init__(self, folder: Path | None, about: Mapping[str, Any], fresh: bool) -> None:
-        self.folder, self._next = folder, 0
-        if folder is None:
-            return
-        index = folder / "estimate.json"
-        if fresh and index.exists():
-            shutil.rmtree(folder / "worlds", ignore_errors=True)
-            (folder / "failures.npz").unlink(missing_ok=True)
-            index.unlink()
-        if (folder / "results.json").exists():
-            raise ResultsError(f"{folder}: holds the results of a sweep; name another folder with --out")
-        (folder / "worlds").mkdir(parents=True, exist_ok=True)
-        self._about = json.loads(json.dumps(about))
-        if index.exists():
-            try:
-                there = json.loads(index.read_text(encoding="utf-8"))["made_by"]
-            except (ValueError, KeyError, TypeError):
-                raise ResultsError(
-                    f"{index}: damaged; remove the folder, or start anew with --fresh"
-                ) from None
-            if (differs := _difference(there, self._about)) is not None:
-                raise ResultsError(f"{folder}: made with {differs}; use another folder, or --fresh")
-        self.write({})
-
-    def write(self, found: Mapping[str, Any]) -> None:
-        """Put down how it is made, and what was found."""
-        if self.folder is not None:
-            text = json.dumps({"made_by": self._about, **found}, indent=1)
-            write_whole(self.folder / "estimate.json", (text + "\n").encode())
-
-    def batch(
-        self, values: NDArray[np.float32], run: Callable[[], tuple[list[str], NDArray[np.float64]]]
-    ) -> tuple[list[str], NDArray[np.float64]]:
-        """Metrics of worlds: those on disk, or those of a run."""
-        number, self._next = self._next, self._next + 1
-        if self.folder is None:
-            return run()
-        path = self.folder / "worlds" / f"{number:06d}.npz"
-        mark = hashlib.blake2b(values.tobytes(), digest_size=16).hexdigest()
-        try:
-            with np.load(path) as kept:
-                if str(kept["mark"]) == mark:
-                    return kept["names"].tolist(), kept["metrics"]
-        except FileNotFoundError:
-            pass
-        except Exception:  # a damaged file is run again
-            path.unlink(missing_ok=True)
-        names, metrics = run()
-        data = io.BytesIO()
-        np.savez_compressed(data, mark=mark, names=names, metrics=metrics)
-        write_whole(path, data.getvalue())
-        return names, metrics
-
-
-def _difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str | None:
-    for name in sorted({*there, *here} - NOT_COMPARED):
-        if there.get(name) != here.get(name):
-            if isinstance(there.get(name), dict) and isinstance(here.get(name), dict):
-                return _difference(there[name], here[name]) or name
-            if name == "source":
-                return "another version of limsim_jax"
-            return f"{name} = {str(there.get(name))[:60]}, now {str(here.get(name))[:60]}"
-    return None
-
-
-class _Worlds:
-    """The limit state of worlds, from their random numbers."""
-
-    def __init__(self, episodes: Episodes, event: Event, log: _Log, tell: Tell | None, most: int) -> None:
-        self.layout = episodes.layout
-        self.event, self._log, self._tell, self._most = event, log, tell, most
-        self._worlds = Numbered(episodes)
-        self.count, self.ran = 0, 0
-        self.exposure: tuple[float, float] | None = None  # hours and km per episode
-        self.found: dict[bytes, dict[str, float]] = {}  # metrics of worlds with the event
-
-    def show(self, values: NDArray[np.float32]) -> Episodes:
-        """Episodes whose seed k is row k of these random numbers."""
-        return self._worlds.show(values, _seeds(values))
-
-    def __call__(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
-        values = self.layout.from_normals(z)
-        names, metrics = self._log.batch(values, lambda: self._run(values))
-        columns = dict(zip(names, metrics, strict=True))
-        g = self.event.limit(columns).reshape(len(z), -1)
-        if self.exposure is None:  # the first batch of every method is of plain worlds
-            hours, km = (np.nansum(columns[x]) / len(z) for x in ("duration", "distance"))
-            self.exposure = float(hours) / 3600, float(km) / 1e3
-        worst = g.argmin(1)
-        for k in np.flatnonzero(g.min(1) <= 0):
-            row = int(k) * self._worlds.each + int(worst[k])
-            self.found[values[k].tobytes()] = {name: float(x[row]) for name, x in columns.items()}
-        self.count += len(z)
-        if self._tell is not None:
-            self._tell(self.count, self._most)
-        return g.min(1)
-
-    def _run(self, values: NDArray[np.float32]) -> tuple[list[str], NDArray[np.float64]]:
-        tell = self._tell
-        metrics = self._worlds.run(
-            values, _seeds(values), tell and (lambda done: tell(self.count + done, self._most))
-        )
-        self.ran += len(values)
-        return list(metrics), np.stack(list(metrics.values()))
-
-
-def _seeds(values: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Seeds of policies: a function of the random numbers of a world."""
-    return np.array([zlib.crc32(row.tobytes()) & 0x7FFFFFFF for row in values], np.int32)
-
-
 def estimate(
     episodes: Episodes,
     event: str,
@@ -343,8 +222,8 @@ def estimate(
         "event": wanted.name, "method": method, "samples": samples, "runs": runs, "least": least,
         "seed": seed, "level": level,
     }  # fmt: skip
-    log = _Log(out, {**episodes.provenance(), "estimate": settings}, fresh)
-    ask = _Worlds(episodes, wanted, log, tell, worlds)
+    log = Log(out, "estimate.json", {**episodes.provenance(), "estimate": settings}, fresh)
+    ask = Asked(episodes, wanted, log, tell, worlds)
     begin = time.perf_counter()
     found = rare_event(
         ask, layout.size, method=method, samples=samples, runs=runs, least=least, level=level, seed=seed
@@ -376,7 +255,7 @@ def estimate(
 
 
 def _distinct(
-    ask: _Worlds, found: RareEvent
+    ask: Asked, found: RareEvent
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], list[dict[str, float]]]:
     """Different worlds with the event by falling weight: chains stay at places."""
     values = ask.layout.from_normals(found.points)
@@ -416,7 +295,7 @@ def shifts_of(episodes: Episodes, found: RareEvent, most: int = 5) -> tuple[Shif
     middle, error = x.mean(0), x.std(0, ddof=1) / np.sqrt(n)
     p = 2 * t.sf(np.abs(middle) / np.maximum(error, 1e-12), n - 1)
     adjusted, half = holm(p.tolist()), t.ppf(0.975, n - 1) * error
-    names = [f"{kind} of all vehicles" for kind in kinds] + _names(episodes)
+    names = [f"{kind} of all vehicles" for kind in kinds] + names_of(episodes)
     order = [k for k in np.argsort(-np.abs(middle)) if adjusted[k] < 0.05][:most]
     return tuple(
         Shift(
@@ -426,20 +305,6 @@ def shifts_of(episodes: Episodes, found: RareEvent, most: int = 5) -> tuple[Shif
         )
         for k in order
     )
-
-
-def _names(episodes: Episodes) -> list[str]:
-    """Every random number in words."""
-    found = []
-    for number in episodes.layout.numbers:
-        lane = lane_of(episodes, number)
-        if number.what == "gap":
-            found.append(f"gap before arrival {number.place + 1} on lane {lane}")
-        elif number.vehicle < episodes.layout.rows:
-            found.append(f"{number.what} of vehicle {number.place + 1} that enters on lane {lane}")
-        else:
-            found.append(f"{number.what} of a vehicle that starts on lane {lane}")
-    return found
 
 
 def failures_of(folder: Path) -> tuple[NDArray[np.float32], Sequence[float]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 
 import numpy as np
@@ -57,3 +58,39 @@ def lane_of(episodes: Episodes, number: Number) -> str:
     """The lane that a random number is about."""
     ids = episodes.town.lane_ids
     return ids[number.lane] if 0 <= number.lane < len(ids) else "?"
+
+
+def names_of(episodes: Episodes) -> list[str]:
+    """Every random number in words, `[D]`."""
+    found = []
+    for number in episodes.layout.numbers:
+        lane = lane_of(episodes, number)
+        if number.what == "gap":
+            found.append(f"gap before arrival {number.place + 1} on lane {lane}")
+        elif number.vehicle < episodes.layout.rows:
+            found.append(f"{number.what} of vehicle {number.place + 1} that enters on lane {lane}")
+        else:
+            found.append(f"{number.what} of a vehicle that starts on lane {lane}")
+    return found
+
+
+def vehicles_of(episodes: Episodes) -> dict[str, NDArray[np.int64]]:
+    """Places in the array of the numbers of each vehicle.
+
+    The gaps of a lane count as one more."""
+    layout, groups = episodes.layout, dict[str, list[int]]()
+    for k, number in enumerate(layout.numbers):
+        lane = lane_of(episodes, number)
+        if number.what == "gap":
+            name = f"arrivals on lane {lane}"
+        elif number.vehicle >= layout.rows:
+            name = f"the vehicle in place {number.vehicle - layout.rows + 1}, lane {lane}"
+        else:
+            name = f"vehicle {number.place + 1} that enters on lane {lane}"
+        groups.setdefault(name, []).append(k)
+    return {name: np.array(numbers) for name, numbers in groups.items()}
+
+
+def policy_seeds(values: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Seeds of policies `[B]`: a function of the random numbers `[B, D]` of a world."""
+    return np.array([zlib.crc32(row.tobytes()) & 0x7FFFFFFF for row in values], np.int32)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limsim_jax.sweeps.episode import Episodes
-from limsim_jax.sweeps.numbered import Numbered, lane_of
+from limsim_jax.sweeps.numbered import Numbered, vehicles_of
 
 Columns = Mapping[str, NDArray[np.float64]]
 Happened = Callable[[Columns], NDArray[np.bool_]]
@@ -113,17 +113,13 @@ def _towards(base: NDArray[np.float64], numbers: NDArray[np.int64], share: float
 
 def _vehicles(episodes: Episodes, seed: int, until: float) -> dict[str, NDArray[np.int64]]:
     """Numbers of each vehicle that is there by then, and of gaps."""
-    rows, due = episodes.layout.rows, np.asarray(episodes.scenario_of(seed).schedule.time)
-    groups: dict[str, list[int]] = {}
-    for k, number in enumerate(episodes.layout.numbers):
-        lane = lane_of(episodes, number)
-        if number.what == "gap":
-            name = f"arrivals on lane {lane}"
-        elif number.vehicle >= rows:
-            name = f"the vehicle in place {number.vehicle - rows + 1}, lane {lane}"
-        elif due[number.vehicle] <= until:
-            name = f"vehicle {number.place + 1} that enters on lane {lane}"
-        else:
-            continue
-        groups.setdefault(name, []).append(k)
-    return {name: np.array(numbers) for name, numbers in groups.items()}
+    layout, due = episodes.layout, np.asarray(episodes.scenario_of(seed).schedule.time)
+
+    def there(vehicle: int) -> bool:
+        return not 0 <= vehicle < layout.rows or bool(due[vehicle] <= until)
+
+    return {
+        name: numbers
+        for name, numbers in vehicles_of(episodes).items()
+        if there(layout.numbers[int(numbers[0])].vehicle)
+    }
