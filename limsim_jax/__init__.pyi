@@ -1,3 +1,5 @@
+from .api.adversary import Adversary as Adversary
+from .api.adversary import adversary as adversary
 from .api.env import Env as Env
 from .api.env import RouteReward as RouteReward
 from .api.estimate import Estimate as Estimate

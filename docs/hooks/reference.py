@@ -26,7 +26,10 @@ NAMES = {
     ],
     "Scenarios of other tools": ["openscenario", "OpenScenarioError"],
     "Sweeps": ["sweep", "Results", "Row", "open_results", "Metric", "ResultsError"],
-    "Rare events": ["estimate", "Estimate", "triage", "sensitivity", "rare_event", "RareEvent"],
+    "Rare events": [
+        *("estimate", "Estimate", "adversary", "Adversary", "triage", "sensitivity"),
+        *("rare_event", "RareEvent"),
+    ],
     "Policies": [
         *("LikeTraffic", "ConstantSpeed", "FollowLane", "PDMClosed", "PDMHybrid", "LimSimTM"),
         *("EndToEnd", "AreaOfInterest", "named", "language", "RuleTable"),

@@ -1,4 +1,4 @@
-"""What `sweep --estimate` does, and the commands about failures: triage and sensitivity."""
+"""What `sweep --estimate` does, and the commands about failures: triage, sensitivity, adversary."""
 
 from __future__ import annotations
 
@@ -139,6 +139,65 @@ def sensitivity(
     print(f"wrote {page}")
 
 
+def adversary(
+    experiment: ExperimentArgument,
+    policy: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Drive the ego by this policy instead.")
+    ] = None,
+    event: Annotated[
+        str, typer.Option(metavar="EVENT", help="What is looked for: contact, fault, or as min_ttc<1.")
+    ] = "contact",
+    reference: Annotated[
+        str, typer.Option(metavar="NAME", help="Policy that drives the failures as well, or none.")
+    ] = "pdm_closed_rules",
+    budget: Annotated[int, typer.Option(help="Worlds in all, at most.")] = 2000,
+    starts: Annotated[int, typer.Option(help="Searches side by side.")] = 4,
+    most: Annotated[int, typer.Option(help="Failures after which the search ends.")] = 5,
+    least_plausible: Annotated[
+        float, typer.Option(help="Share of random worlds that are as unusual as a failure, at least.")
+    ] = 0.01,
+    seed: Annotated[int, typer.Option(help="The first plain world, and the seed of the searches.")] = 0,
+    chunk: Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder to write.  [default: results/NAME-adversary]"),
+    ] = None,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Remove what is there of this search, and start anew.")
+    ] = False,
+    replays: Annotated[
+        bool, typer.Option("--replays/--no-replays", help="Write replays of up to three failures.")
+    ] = True,
+    json_file: JsonOption = None,
+) -> None:
+    """Search for plausible worlds in which a policy fails. It gives no probability."""
+    from limsim_jax.api.adversary import adversary as run
+    from limsim_jax.api.experiment import Experiment
+    from limsim_jax.files import check_writable
+    from limsim_jax.sweeps.experiment import read_experiments
+
+    if chunk is not None and chunk < 1:
+        raise typer.BadParameter(f"{chunk}; at least 1", param_hint="--chunk")
+    one = _one(read_experiments(experiment, policy=policy), "EXPERIMENT")
+    check_writable(json_file)
+    folder = Path("results") / f"{one.name}-adversary" if out is None else out
+    begin = time.perf_counter()
+    found = run(
+        Experiment(one), event, reference=None if reference == "none" else reference, worlds=budget,
+        starts=starts, most=most, least_plausible=least_plausible, seed=seed, out=folder, chunk=chunk,
+        fresh=fresh,
+    )  # fmt: skip
+    table(found.rows(), f"{found.scenario}, {found.policy}: {found.event.name}")
+    if json_file is not None:
+        write_json(json_file, found.as_json())
+        print(f"wrote {json_file}")
+    if replays:
+        for k in range(min(REPLAYS, len(found.failures))):
+            path = found.replay(k).save(folder / "replays" / f"failure-{k}.html")
+            print(f"wrote {path}")
+    print(f"{found.worlds.total:,} worlds in {time.perf_counter() - begin:.0f} s, kept in {folder}")
+
+
 def _one(experiments: Sequence[ExperimentFile], hint: str) -> ExperimentFile:
     """The only experiment; `hint` is the parameter that several do not go with."""
     if len(experiments) != 1:
@@ -149,5 +208,5 @@ def _one(experiments: Sequence[ExperimentFile], hint: str) -> ExperimentFile:
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    for command in (triage, sensitivity):
+    for command in (triage, sensitivity, adversary):
         app.command()(command)

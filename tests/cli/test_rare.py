@@ -38,12 +38,33 @@ def test_scenarios_have_no_estimate(options, said, capsys, tmp_path):
     assert said in err and err.count("\n") == 1
 
 
-@pytest.mark.parametrize("command", [["sweep", "paper", "--estimate", "contact"], ["sensitivity", "paper"]])
+ONE = [["sweep", "paper", "--estimate", "contact"], ["sensitivity", "paper"], ["adversary", "paper"]]
+
+
+@pytest.mark.parametrize("command", ONE, ids=[command[0] for command in ONE])
 def test_one_experiment_at_a_time(command, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert cli.main(command) == 2
     err = capsys.readouterr().err
     assert "one experiment at a time, not highway, ramp" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--event", "crash"), "event: 'crash'; known are contact, fault, and conditions such as min_ttc<1"),
+        (("--budget", "50"), "worlds: 50 are too few for 4 starts with 5,336 random numbers; at least 220"),
+        (("--reference", "nope"), "reference: roundabout: ego.policy: unknown policy 'nope'; known are "),
+        (("--reference", "like_traffic"), "reference: 'like_traffic' is the policy under test; name another"),
+        (("--chunk", "0"), "--chunk: 0; at least 1"),
+    ],
+)
+def test_an_adversary_refuses_in_one_line(options, said, capsys, tmp_path):
+    command = ["adversary", "roundabout", "--policy", "like_traffic", *options]
+    assert cli.main([*command, "--out", str(tmp_path / "out")]) == 2
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_triage_of_no_results_is_one_line(capsys, tmp_path):
