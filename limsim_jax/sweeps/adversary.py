@@ -281,6 +281,7 @@ class _Search:
         if len(hits):
             k = hits[np.linalg.norm(worlds[hits], axis=1).argmin()]
             return Hit(worlds[k], self.start.seed, True, self.plausible)
+        # it is told the worlds that ran, not those it asked for, so that it stays among plausible ones
         points = np.concatenate([worlds[:, self.plausible.numbers], self._extra], 1)
         self._cma.tell(list(zip(points, limits.tolist(), strict=True)))
         nearer = limits.min() < self.best
