@@ -12,6 +12,7 @@ from .api.experiment import Obstacle as Obstacle
 from .api.experiment import Vehicle as Vehicle
 from .api.experiment import Zone as Zone
 from .api.experiment import load_experiments as load_experiments
+from .api.exposure import exposure as exposure
 from .api.map import Map as Map
 from .api.map import load_map as load_map
 from .api.perception import Perception as Perception
@@ -83,6 +84,7 @@ from .simulation.rollout import Rollout as Rollout
 from .simulation.worlds import Worlds as Worlds
 from .sweeps.experiment import ExperimentError as ExperimentError
 from .sweeps.experiment import bundled_experiments as bundled_experiments
+from .sweeps.exposure import Exposure as Exposure
 from .sweeps.store import ResultsError as ResultsError
 from .traffic.car_following import ACC as ACC
 from .traffic.car_following import IDM as IDM

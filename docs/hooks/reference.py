@@ -30,6 +30,7 @@ NAMES = {
         *("estimate", "Estimate", "adversary", "Adversary", "triage", "sensitivity"),
         *("rare_event", "RareEvent"),
     ],
+    "Coverage": ["exposure", "Exposure"],
     "Policies": [
         *("LikeTraffic", "ConstantSpeed", "FollowLane", "PDMClosed", "PDMHybrid", "LimSimTM"),
         *("EndToEnd", "AreaOfInterest", "named", "language", "RuleTable"),

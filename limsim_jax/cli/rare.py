@@ -1,4 +1,4 @@
-"""What `sweep --estimate` does, and the commands about failures: triage, sensitivity, adversary."""
+"""What `sweep --estimate` does, and the commands triage, sensitivity, adversary, exposure."""
 
 from __future__ import annotations
 
@@ -198,6 +198,75 @@ def adversary(
     print(f"{found.worlds.total:,} worlds in {time.perf_counter() - begin:.0f} s, kept in {folder}")
 
 
+def exposure(
+    experiment: ExperimentArgument,
+    policy: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Drive the ego by this policy instead.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="How many worlds: seeds 0, 1, 2, ...")] = 50,
+    dimensions: Annotated[
+        str | None,
+        typer.Option(metavar="A,B", help="Of speed, gap, ttc, manoeuvre, road.  [default: all]"),
+    ] = None,
+    edges: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=X,Y", help="Edges of the bins of a dimension, m/s, m or s; may be repeated."
+        ),
+    ] = None,
+    search: Annotated[
+        int, typer.Option(min=0, help="Further seeds, at most, that look for cells not covered.")
+    ] = 0,
+    replays: Annotated[
+        int, typer.Option(min=0, help="Worlds with rare cells that are written as replays.")
+    ] = REPLAYS,
+    chunk: Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder to write to.  [default: results/NAME-exposure]"),
+    ] = None,
+) -> None:
+    """Say how long the ego is in which situations.
+
+    Situations are bins of speed, gap, TTC, manoeuvre and road. It lists those that are not covered."""
+    from limsim_jax.api.experiment import Experiment
+    from limsim_jax.api.exposure import exposure as run
+    from limsim_jax.api.exposure import write
+    from limsim_jax.files import check_writable
+    from limsim_jax.metrics.domain import domain_of
+    from limsim_jax.sweeps.experiment import read_experiments
+
+    one = _one(read_experiments(experiment, policy=policy), "EXPERIMENT")
+    names = None if dimensions is None else [name.strip() for name in dimensions.split(",")]
+    bins = _edges(edges or [])
+    domain_of(names, bins)
+    folder = Path("results") / f"{one.name}-exposure" if out is None else out
+    folder.mkdir(parents=True, exist_ok=True)
+    check_writable(folder / "exposure.json", folder / "exposure.html")
+    begin = time.perf_counter()
+    found = run(Experiment(one), seeds=seeds, dimensions=names, edges=bins, search=search, chunk=chunk)
+    print(found)
+    page = write(found, folder, replays=replays)
+    more = 0 if found.more is None else len(found.more.seeds)
+    print(f"{len(found.seeds) + more:,} worlds in {time.perf_counter() - begin:.0f} s")
+    for path in (folder / "exposure.json", page):
+        print(f"wrote {path}")
+
+
+def _edges(options: Sequence[str]) -> dict[str, list[float]]:
+    """NAME=X,Y as numbers by name."""
+    found = {}
+    for text in options:
+        name, sign, numbers = text.partition("=")
+        try:
+            found[name.strip()] = [float(x) for x in numbers.split(",")]
+        except ValueError:
+            sign = ""
+        if not sign:
+            raise typer.BadParameter(f"'{text}'; NAME=X,Y is expected, as gap=5,20,50", param_hint="--edges")
+    return found
+
+
 def _one(experiments: Sequence[ExperimentFile], hint: str) -> ExperimentFile:
     """The only experiment; `hint` is the parameter that several do not go with."""
     if len(experiments) != 1:
@@ -208,5 +277,5 @@ def _one(experiments: Sequence[ExperimentFile], hint: str) -> ExperimentFile:
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    for command in (triage, sensitivity, adversary):
+    for command in (triage, sensitivity, adversary, exposure):
         app.command()(command)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ from jaxtyping import Array, Int
 
 from limsim_jax.files import no_garbage_collection
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.simulation.rollout import KEPT, Result, Rollout, Started, started
+from limsim_jax.simulation.rollout import KEPT, Measure, Result, Rollout, Started, started
 from limsim_jax.simulation.totals import Totals
 from limsim_jax.types import Scenario
 from limsim_jax.xla import (
@@ -98,7 +99,7 @@ class Worlds:
         self.lane_map = jax.device_put(lane_map, NamedSharding(self.mesh, PartitionSpec()))
         self.rollout = run
 
-        self._given = given
+        self._given, self._sampler = given, sampler
 
         def start(lane_map: LaneMap, of: Any) -> Started:
             if given is None:
@@ -118,6 +119,18 @@ class Worlds:
         self._advance_jit: Any = over_worlds(advance, self.mesh, consumes=True)
         self._start: Any = None
         self._advance: Any = None
+
+    def measuring(self, measure: Measure, name: str | None = None) -> Worlds:
+        """The same worlds, measured by something else; a program of their own.
+
+        `name`: all that the measure depends on; None: the program is not kept on disk.
+        """
+        sampling, running = self.names
+        running = None if running is None or name is None else f"{running} measured by {name}"
+        return Worlds(
+            replace(self.rollout, measure=measure), self.lane_map, self._sampler, chunk=self.chunk,
+            devices=list(self.mesh.devices.flat), names=(sampling, running), given=self._given,
+        )  # fmt: skip
 
     def compile(self) -> Worlds:
         """Get the programs ready; otherwise the first chunk does."""

@@ -76,6 +76,18 @@ def distributions(samples: Sequence[NDArray[Any]], names: Sequence[str], axis: s
     return _svg(figure, title)
 
 
+def curve(x: NDArray[Any], y: NDArray[Any], across: str, up: str, title: str) -> Markup:
+    """One line from 0 on; `across` and `up` are the titles of the axes."""
+    figure, ax = _axes(190)
+    ax.plot(x, y, color=_SERIES[0], lw=1.6, solid_joinstyle="round")
+    ax.set_xlim(0, max(float(x[-1]), 1))
+    ax.set_ylim(bottom=0)
+    ax.grid(axis="y", color=_LINE, lw=1)
+    ax.set_xlabel(across, color=_SOFT)
+    ax.set_ylabel(up, color=_SOFT)
+    return _svg(figure, title)
+
+
 def _axes(height: float) -> tuple[Figure, Axes]:
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator, StrMethodFormatter
