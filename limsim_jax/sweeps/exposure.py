@@ -357,7 +357,11 @@ class Exposure:
                 for k in np.flatnonzero(self.covered)
             ],
             "not_covered": [_places(self.domain, k) for k in np.flatnonzero(missing)],
-            "rare": [{"cell": cell, "visits": [x._asdict() for x in seen]} for cell, seen in self.rare()],
+            "rare": [
+                {"cell": cell, "visits": [x._asdict() for x in seen]}
+                for part in (self, *(self.parts() if len(self.domain.names) > WAYS else ()))
+                for cell, seen in part.rare()
+            ],
             "tables": [
                 {
                     "dimensions": list(part.domain.names), "seconds": part.seconds.tolist(),

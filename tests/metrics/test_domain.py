@@ -110,6 +110,9 @@ def test_cells_have_numbers_in_the_order_of_the_dimensions():
     assert np.flatnonzero(domain.matching({"gap": "no leader"})).tolist() == [3, 7, 11]
     less, cells = domain.over(["gap"])
     assert less.names == ("gap",) and cells.tolist() == [0, 1, 2, 3] * 3
+    three = domain_of(["speed", "gap", "ttc"], {"gap": [5], "speed": [1], "ttc": [2]})
+    less, cells = three.over(["ttc", "speed"])
+    assert less.names == ("speed", "ttc") and cells.tolist() == [0, 1, 2, 0, 1, 2, 0, 1, 2, *[3, 4, 5] * 3]
 
 
 def test_bins_have_names_of_their_own():

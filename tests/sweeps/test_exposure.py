@@ -339,12 +339,14 @@ def test_seeds_of_cells():
         (("1 to 10", "no leader"), 15), (("10 and more", "below 5"), 15),
     ]  # fmt: skip
     assert searched().seeds_for({"speed": 20, "gap": 1}) == [15]
+    assert searched().seeds_for({"speed": 5.0, "gap": 6}) == [10, 11, 12, 14], "those of a search are last"
 
 
 def test_sets_of_seeds_and_what_is_to_come():
     found = small()
     assert found.cover() == [(10, 2), (12, 1), (13, 1)]
     assert sum(x.adds for x in found.cover(1)) == 2 + 4
+    assert found.growth(1)[1][-1] == pytest.approx(2 + 4), "bins of both dimensions, apart"
     at, cells = found.growth()
     assert (
         at.tolist() == [0, 1, 2, 3, 4] and cells[-1] == pytest.approx(4) and cells[1] == pytest.approx(6 / 4)
