@@ -338,7 +338,7 @@ class Roads:
             found = self._way(way[-1], before.s, after)
             if found is None:
                 raise PlaceError(f"there is no way from lane {way[-1].id} to lane {after.lane.id}")
-            way += [x for x in found if x is not way[-1]]
+            way[-1:] = found  # it may begin on a lane beside the last one, which is then left at once
         return way
 
     def _way(self, start: Lane, s: float, goal: Spot) -> list[Lane] | None:
