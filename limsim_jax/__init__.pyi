@@ -71,6 +71,8 @@ from .scenarios.instructions.intent import InstructionError as InstructionError
 from .scenarios.instructions.intent import Intent as Intent
 from .scenarios.instructions.model import LanguageModel as LanguageModel
 from .scenarios.instructions.scenario import scenario as scenario
+from .scenarios.library.catalogue import LibraryError as LibraryError
+from .scenarios.library.catalogue import library as library
 from .scenarios.openscenario.scenario import openscenario as openscenario
 from .scenarios.openscenario.source import OpenScenarioError as OpenScenarioError
 from .sensors.faults import Faults as Faults

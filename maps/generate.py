@@ -1,4 +1,4 @@
-"""Write the five bundled OpenDRIVE maps that lie beside this script.
+"""Write the five bundled OpenDRIVE maps, and those of the scenario library.
 
     python maps/generate.py           write them
     python maps/generate.py --check   fail unless the files are what would be written
@@ -60,6 +60,7 @@ from mapbuilder.urban import (
 from mapbuilder.writer import write
 
 FOLDER = Path(__file__).parent
+LIBRARY = FOLDER.parent / "limsim_jax/scenarios/library/scenarios/maps"
 
 
 def highway() -> Map:
@@ -288,6 +289,69 @@ def long_route() -> Map:
     return m
 
 
+def motorway() -> Map:
+    """A straight motorway, one way, with three lanes."""
+    m = Map("motorway")
+    lanes = [*(Lane(f"l{k}", 3.75) for k in (1, 2, 3)), HARD]
+    m.road("motorway", Curve(Pose(0, 0, 0), [Piece(1500)]), [Section(0, lanes)], kind="motorway", speed=130)
+    return m
+
+
+def lane_end() -> Map:
+    """A straight motorway, one way, whose third and right lane ends."""
+    m = Map("lane_end")
+    ends = Lane("ends", Profile((450, 3.75), (525, 0)))
+    two = [Lane("l1", 3.75), Lane("l2", 3.75)]
+    three = [*two, ends, HARD]
+    sections = [Section(0, three), Section(450, three), Section(525, [*two, HARD])]
+    m.road("motorway", Curve(Pose(0, 0, 0), [Piece(1500)]), sections, kind="motorway", speed=100)
+    return m
+
+
+def crossing() -> Map:
+    """A town crossing with a priority road from west to east.
+
+    Each lane has one way on, so that every vehicle drives as scenarios say, whatever its goal. From the east
+    one lane turns left.
+    """
+    m = Map("crossing")
+    mouth = 12.0
+    arms = {}
+    for name, x, y, heading, length in (
+        ("west", -mouth, 0, 0, 250),
+        ("east", mouth, 0, math.pi, 250),
+        ("south", 0, -mouth, math.pi / 2, 150),
+        ("north", 0, mouth, -math.pi / 2, 150),
+    ):
+        curve = inwards(Pose(x, y, heading), [Piece(length)])
+        left = [Lane("left", 3.25)] if name == "east" else []
+        arms[name] = street(m, name, curve, [*left, Lane("in", 3.25)], [Lane("out", 3.25)])
+    junction = m.junction("crossing")
+    moves: Moves = [
+        (a, [lane], b, ["out"])
+        for a, lane, b in (
+            ("west", "in", "east"),
+            ("east", "in", "west"),
+            ("east", "left", "south"),
+            ("south", "in", "north"),
+            ("north", "in", "south"),
+        )
+    ]
+    made = connect_all(junction, arms, moves)
+    minor = [*made["south"], *made["north"]]
+    junction.priorities += [(high, low) for high in [*made["west"], *made["east"]] for low in minor]
+    for name, (sign, said) in {
+        "west": ("306", "priority road"),
+        "east": ("306", "priority road"),
+        "south": ("205", "yield"),
+        "north": ("205", "yield"),
+    }.items():
+        enter = arms[name].enter
+        assert enter
+        m.sign(enter, 0.5, enter.keys(leaving=True), sign, name=said)
+    return m
+
+
 MAPS = {
     "highway": highway,
     "ramp": ramp,
@@ -295,6 +359,7 @@ MAPS = {
     "roundabout": roundabout_map,
     "long_route": long_route,
 }
+OF_LIBRARY = {"motorway": motorway, "lane_end": lane_end, "crossing": crossing}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -303,8 +368,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--check", action="store_true", help="write nothing; fail if a file differs")
     check = parser.parse_args(arguments).check
     stale = []
-    for name, build in MAPS.items():
-        path, data = FOLDER / f"{name}.xodr", write(build())
+    every = [(FOLDER, MAPS), (LIBRARY, OF_LIBRARY)]
+    for path, build in [(folder / f"{name}.xodr", x) for folder, maps in every for name, x in maps.items()]:
+        data = write(build())
         if not check:
             path.write_bytes(data)
         elif not path.is_file() or path.read_bytes() != data:

@@ -25,6 +25,7 @@ NAMES = {
         "ExperimentError",
     ],
     "Scenarios of other tools": ["openscenario", "OpenScenarioError"],
+    "Scenario library": ["library", "LibraryError"],
     "Sweeps": ["sweep", "Results", "Row", "open_results", "Metric", "ResultsError"],
     "Rare events": [
         *("estimate", "Estimate", "adversary", "Adversary", "triage", "sensitivity"),

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from limsim_jax.api.map import Map, load_map
 from limsim_jax.maps import bundled_maps
 from limsim_jax.maps.network import MapError, Network
+from limsim_jax.scenarios.library.catalogue import scenario_file
 from limsim_jax.sweeps import experiment as _file
 from limsim_jax.sweeps.experiment import (
     ActionTable,
@@ -270,6 +271,11 @@ def load_experiments(
     if isinstance(source, Experiment):
         return [source]
     if isinstance(source, str | Path):
+        if not Path(source).is_file() and scenario_file(source) is not None:
+            raise ExperimentError(
+                f"{source}: is a scenario of the library, and no experiment; lj.openscenario has its "
+                f"variants, and they run by limsim-jax sweep {source}"
+            )
         return [Experiment(file) for file in read_experiments(source)]
     return [experiment for one in source for experiment in load_experiments(one)]
 

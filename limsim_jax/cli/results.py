@@ -28,7 +28,8 @@ ExperimentArgument = Annotated[
     str,
     typer.Argument(
         metavar="EXPERIMENT",
-        help="Experiment file (.toml, .sumocfg, .xosc, or a folder of .xosc), or the name of a bundled one.",
+        help="Experiment file (.toml, .sumocfg, .xosc, or a folder of .xosc), or the name of a bundled one, "
+        "or of a scenario of the library.",
     ),
 ]
 ResultsArgument = Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder that a sweep has written.")]
@@ -171,8 +172,6 @@ def sweep(
     """Run an experiment with many seeds; go on where an earlier run has stopped.
 
     The exit code is 1 if the policy failed in an episode."""
-    from limsim_jax.sweeps.experiment import read_experiments
-
     part, stop = _shard(shard), _until(until_ci)
     if event is None:
         _refuse(
@@ -226,7 +225,7 @@ def sweep(
         experiments: list[ExperimentFile] = []
     else:
         _refuse(in_sumo, "only with --engine sumo")
-        experiments = read_experiments(experiment, map_file=map_file, policy=policy)
+        experiments = _named(experiment, map_file, policy)
     folder = Path("results") / Path(experiment).stem if out is None else out
     if event is not None:
         from limsim_jax.cli.rare import estimate
@@ -285,6 +284,17 @@ def sweep(
         if failed := failed_policies(opened):
             print("\n".join(failure.text for failure in failed))
             raise typer.Exit(1)
+
+
+def _named(name: str, map_file: str | None, policy: str | None) -> list[ExperimentFile]:
+    """The experiments of a name; one that is not known may be close to a scenario of the library."""
+    from limsim_jax.scenarios.library.catalogue import close_to
+    from limsim_jax.sweeps.experiment import ExperimentError, bundled_experiments, read_experiments
+
+    close = [] if Path(name).is_file() or Path(name).stem in bundled_experiments() else close_to(name)
+    if close:
+        raise ExperimentError(f"{name}: no such file; in the scenario library there is {', '.join(close)}")
+    return read_experiments(name, map_file=map_file, policy=policy)
 
 
 def warm(

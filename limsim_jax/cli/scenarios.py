@@ -1,4 +1,4 @@
-"""Commands about scenarios of other tools: check, and sweeps over their variants."""
+"""Commands about scenario files: check, the library, and sweeps over their variants."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import typer
 from limsim_jax.cli.common import JsonOption, table, write_json
 
 if TYPE_CHECKING:
+    from limsim_jax.scenarios.library.catalogue import Entry
     from limsim_jax.sweeps.runner import Progress
 
 RootOption = Annotated[
@@ -25,11 +26,16 @@ LenientOption = Annotated[
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command()(check)
+    app.command()(library)
 
 
 def check(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Scenario or distribution, OpenSCENARIO XML (.xosc).")
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="Scenario or distribution, OpenSCENARIO XML (.xosc), or the name of one of the library.",
+        ),
     ],
     root: RootOption = None,
     lenient: LenientOption = False,
@@ -59,17 +65,76 @@ def check(
     print(found)
 
 
+def library(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Entry to tell about.  [default: a table of all]")
+    ] = None,
+    tag: Annotated[
+        list[str] | None, typer.Option(metavar="TAG", help="Entries with this tag; of several, with all.")
+    ] = None,
+    search: Annotated[str, typer.Option(metavar="WORDS", help="Entries with these words.")] = "",
+    json_file: JsonOption = None,
+) -> None:
+    """Show the scenario library: what happens, parameters, and what reference drivers make of it."""
+    from limsim_jax.scenarios.library.catalogue import drivers, entry, tags
+    from limsim_jax.scenarios.library.catalogue import library as entries
+
+    if name is not None:
+        if tag or search:
+            raise typer.BadParameter("an entry, or a choice by --tag and --search", param_hint="NAME")
+        found = entry(name)
+        print(found)
+        if json_file is not None:
+            write_json(json_file, _as_json(found))
+        return
+    chosen = entries(*(tag or ()), search=search)
+    if json_file is not None:
+        write_json(json_file, [_as_json(x) for x in chosen])
+    if not chosen:
+        print("no entry has all of that")
+        return
+    table(chosen.rows(), head=("name", "variants", *drivers(), "what happens"), wide=True)
+    print(f"columns of drivers: how many of a sample of variants passed. Tell about one: {_COMMAND} NAME")
+    for kind, some in tags().items():
+        print(f"--tag, {kind}: {', '.join(some)}")
+
+
+_COMMAND = "limsim-jax library"
+
+
+def _as_json(one: Entry) -> dict[str, Any]:
+    """All that is known of an entry, as plain values."""
+    return {
+        "name": one.name,
+        "kind": one.kind,
+        "title": one.title,
+        "tags": list(one.tags),
+        "licence": one.licence,
+        "file": None if one.path is None else str(one.path),
+        "map": None if one.map_file is None else str(one.map_file),
+        "variants": one.variants,
+        "parameters": [x._asdict() | {"values": list(x.values)} for x in one.parameters],
+        "outcomes": [x._asdict() for x in one.outcomes],
+        "address": one.address,
+        "command": one.command,
+    }
+
+
 def is_scenario(name: str) -> bool:
-    """Whether an argument names a scenario, or a folder of them."""
+    """Whether an argument names scenarios: files, folders, or of the library."""
+    from limsim_jax.scenarios.library.catalogue import scenario_file
+
     path = Path(name)
-    return path.suffix.lower() == ".xosc" or (path.is_dir() and any(path.glob("*.xosc")))
+    if path.suffix.lower() == ".xosc" or (path.is_dir() and any(path.glob("*.xosc"))):
+        return True
+    return not path.is_file() and scenario_file(name) is not None
 
 
 def files_of(path: Path) -> list[Path]:
     """The files to run: of a folder its distributions, or its scenarios if it has none."""
-    if not path.is_dir():
+    files = sorted(path.glob("*.xosc")) if path.is_dir() else []
+    if not files:
         return [path]
-    files = sorted(path.glob("*.xosc"))
     varied = [x for x in files if b"ParameterValueDistribution" in x.read_bytes()]
     return varied or files
 

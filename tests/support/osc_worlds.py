@@ -17,6 +17,7 @@ from limsim_jax.scenarios.openscenario.padding import Sizes
 from limsim_jax.scenarios.openscenario.player import Bodies, step
 from limsim_jax.scenarios.openscenario.roads import Roads
 from limsim_jax.scenarios.openscenario.scenario import openscenario
+from limsim_jax.scenarios.openscenario.storyboard import Scenario
 
 WIDTH = 3.5
 
@@ -116,8 +117,15 @@ def play(
     """Play a scenario without traffic or policy."""
     roads = straight(folder) if roads is None else roads
     scenario = openscenario(xosc.write(folder, text)).scenario()
-    built = build(scenario, roads, dt, script=True, sizes=SIZES, **options)
-    assert built.sizes == SIZES
+    return played(scenario, roads, seconds, dt, SIZES, **options)
+
+
+def played(
+    scenario: Scenario, roads: Roads, seconds: float, dt: float, sizes: Sizes, **options: Any
+) -> Played:
+    """Play a resolved scenario without traffic or policy; its arrays have these sizes."""
+    built = build(scenario, roads, dt, script=True, sizes=sizes, **options)
+    assert built.sizes == sizes
     board, memory = as_device((built.board, built.memory))
     steps = round(seconds / dt)
     after = run(board, memory, steps, dt)

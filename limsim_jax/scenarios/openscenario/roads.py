@@ -87,7 +87,7 @@ class Roads:
         self.town, self.network = town, town.network
         # variants of a scenario start in few places
         self.nearest = lru_cache(4096)(self._nearest)
-        self._open_corridor = lru_cache(256)(self._made_corridor)
+        self._corridor_of = lru_cache(256)(self._made_corridor)
         self._lanes: dict[str, dict[int, list[Lane]]] = defaultdict(lambda: defaultdict(list))
         for lane in self.network.lanes.values():
             self._lanes[lane.road][lane.number].append(lane)
@@ -203,8 +203,7 @@ class Roads:
         """
         if spot is None:
             return straight(pose)
-        route = tuple(x.id for x in route)
-        return self._open_corridor(spot.lane.id, spot.s, spot.d, pose, route)
+        return self._corridor_of(spot.lane.id, spot.s, spot.d, pose, tuple(x.id for x in route))
 
     def _made_corridor(self, lane: str, s: float, d: float, pose: Pose, route: tuple[str, ...]) -> Corridor:
         spot = Spot(self.network.lanes[lane], s, d)

@@ -246,16 +246,29 @@ class OpenScenario:
 def openscenario(path: str | Path, *, lenient: bool = False, root: str | Path | None = None) -> OpenScenario:
     """Read a file of OpenSCENARIO XML 1.0 to 1.3.
 
-    It is a scenario, or a distribution of the parameters of one.
+    It is a scenario, or a distribution of the parameters of one. Scenarios of the library have names.
 
     Args:
-      path: `.xosc` file. Catalogs lie in its folder or below.
+      path: `.xosc` file. Catalogs lie in its folder or below. Where there is no such file: a name of the
+        scenario library, as `cut_in`.
       lenient: elements that are not supported are listed in `notes`, not refused.
       root: folder in which catalogs may lie, where they are not below that of the file.
 
     Raises:
       OpenScenarioError: one line with file, line, element and reason.
     """
-    found = OpenScenario(path, lenient=lenient, root=root)
+    found = OpenScenario(_file(Path(path)), lenient=lenient, root=root)
     found.scenario()
     return found
+
+
+def _file(path: Path) -> Path:
+    """The file, or that of the library."""
+    from limsim_jax.scenarios.library.catalogue import close_to, scenario_file
+
+    if path.is_file():
+        return path
+    found = scenario_file(path)
+    if found is None and not path.exists() and (close := close_to(path)):
+        raise OpenScenarioError(f"{path}: no such file; in the scenario library there is {', '.join(close)}")
+    return path if found is None else found
