@@ -24,8 +24,9 @@ from limsim_jax.simulation.totals import Totals
 from limsim_jax.types import Scenario
 from limsim_jax.xla import (
     enable_compilation_cache,
+    held_program,
+    hold_program,
     keep_program,
-    load_program,
     run_often,
     run_once,
     shared_program,
@@ -141,7 +142,7 @@ class Worlds:
 
         aside = contextlib.nullcontext() if self._advance_name is None else without_compilation_cache()
         with ThreadPoolExecutor(1) as pool, no_garbage_collection(), aside:
-            start = load_program(self._start_name)
+            start = held_program(self._start_name)
             if start is None:
                 lowered = self._start_jit.lower(self.lane_map, seeds)
                 kept = pool.submit(lambda: keep_program(self._start_name, lowered.compile()))
@@ -150,8 +151,12 @@ class Worlds:
                 kept, worlds = None, start.out_info
             name = None if self._advance_name is None else f"{self._advance_name} {_shapes(worlds)}"
             shared = self.lane_map, np.int32(0)
-            advance = shared_program(name, lambda: self._advance_jit.lower(shared, worlds).compile())
-            self._start, self._advance = start if kept is None else kept.result(), advance
+            advance = held_program(name)
+            if advance is None:
+                compiled = lambda: self._advance_jit.lower(shared, worlds).compile()  # noqa: E731
+                advance = hold_program(name, shared_program(name, compiled))
+            self._start = start if kept is None else hold_program(self._start_name, kept.result())
+            self._advance = advance
         return self
 
     def start(self, seeds: Sequence[int]) -> Started:

@@ -1,6 +1,7 @@
 """Scenarios in the engine: entities beside an ego that a policy drives, and variants in a sweep."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -9,6 +10,9 @@ from osc_worlds import play, road
 
 from limsim_jax import cli
 from limsim_jax.api import results as stored
+from limsim_jax.maps.lane_map import lane_rows
+from limsim_jax.maps.map import load_map
+from limsim_jax.maps.network import Turn
 from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.scenarios.openscenario.episodes import episodes_of, rebuild
 from limsim_jax.scenarios.openscenario.scenario import openscenario
@@ -115,6 +119,31 @@ def test_worlds_are_made_again_from_their_provenance(tmp_path, policy, name):
     assert json.loads(json.dumps(again.provenance())) == about
     with pytest.raises(ExperimentError, match="has variants, no random numbers"):
         _ = again.layout
+
+
+def test_a_policy_goes_where_the_script_goes(tmp_path):
+    """At a junction straight on, also where another way out is nearer."""
+    town = load_map("long_route")
+    shutil.copy(town.source, tmp_path / "road.xodr")
+    rows, lanes = lane_rows(town.network), town.network.lanes
+    next_lane = np.asarray(town.lanes.routes.next_lane)
+    nearer = 0
+    for straight in town.network.movements:
+        lane = lanes[straight.incoming]
+        ways = {x.turn for x in town.network.movements if x.incoming == lane.id}
+        if straight.turn is not Turn.STRAIGHT or len(ways) < 2 or lane.length < 40:
+            continue
+        place = xosc.lane(lane.number, float(np.interp(lane.length - 30, lane.s, lane.road_s)), lane.road)
+        begin = xosc.start("Ego", place, 8)
+        end = xosc.trigger(xosc.time_condition(5), tag="StopTrigger")
+        path = xosc.write(tmp_path, xosc.scenario(xosc.entity("Ego"), begin, "", end))
+        (made,) = episodes_of(openscenario(path), "pdm_closed", chunk=1)
+        goal = int(made.worlds_of([0]).start.goal[0, 0])
+        assert next_lane[rows[lane.id], goal] == rows[straight.via[0]], straight
+        routes = town.lanes.routes
+        nearest = int(np.argmin(np.where(next_lane[rows[lane.id]] >= 0, routes.distance[rows[lane.id]], 1e9)))
+        nearer += next_lane[rows[lane.id], nearest] != rows[straight.via[0]]
+    assert nearer > 0
 
 
 def test_maps_are_found(tmp_path):

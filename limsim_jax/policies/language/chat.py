@@ -15,6 +15,7 @@ import random
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from types import ModuleType
 from typing import Any
 from urllib.parse import urlsplit
@@ -46,6 +47,12 @@ def load_httpx() -> ModuleType:
     except ModuleNotFoundError:
         raise ValueError('the language driver needs httpx: pip install "limsim-jax[language]"') from None
     return httpx
+
+
+@cache
+def _certificates() -> Any:
+    """Read once: that takes 20 ms, and there is a client per decision."""
+    return load_httpx().create_ssl_context(trust_env=False)
 
 
 @dataclass(frozen=True)
@@ -136,7 +143,8 @@ class Chat:
         """An `httpx.AsyncClient`; use it as `async with`."""
         httpx = load_httpx()
         timeout = httpx.Timeout(self.timeout, connect=min(CONNECT_TIMEOUT, self.timeout))
-        return httpx.AsyncClient(timeout=timeout, headers=self.server.headers(), trust_env=False)
+        headers = self.server.headers()
+        return httpx.AsyncClient(timeout=timeout, headers=headers, trust_env=False, verify=_certificates())
 
     async def ask(self, client: Any, request: Mapping[str, Any]) -> Outcome:
         """One question.

@@ -13,7 +13,7 @@ import numpy as np
 
 from limsim_jax.maps.lane_map import lane_rows
 from limsim_jax.maps.map import Map
-from limsim_jax.scenarios.openscenario.arrays import Board, Memory
+from limsim_jax.scenarios.openscenario.arrays import Board, Kind, Memory
 from limsim_jax.scenarios.openscenario.build import Built
 from limsim_jax.scenarios.openscenario.player import Bodies, step
 from limsim_jax.scenarios.openscenario.roads import Pose, Roads
@@ -184,4 +184,19 @@ def _starts(built: Built, roads: Roads, order: list[int], slots: int) -> tuple[A
         leads = (next_lane[row] >= 0) | is_goal[row]
         cost = np.where(leads, distance[row], distance[row] + 1e7)
         goal[k] = int(np.argmin(cost))
+        end = roads.nearest(_end_of_way(built, roads, entity))
+        if end is not None:  # the way out at the end of its way, if it can get there
+            there = rows[end.lane.id]
+            beyond = np.where(leads & ((next_lane[there] >= 0) | is_goal[there]), distance[there], np.inf)
+            goal[k] = int(np.argmin(beyond)) if np.isfinite(beyond).any() else goal[k]
     return lane, s, d, v, goal, active
+
+
+def _end_of_way(built: Built, roads: Roads, entity: int) -> Pose:
+    """The end of the way of an entity: of its route, or straight on from its start."""
+    board, actions = built.board, built.board.actions
+    routes = np.flatnonzero((actions.kind == Kind.ROUTE) & (actions.entity == entity))
+    way = int(actions.corridor[routes[0]] if len(routes) else built.memory.corridor[entity])
+    x, y, h = np.asarray(board.corridors.line[way, board.corridors.last[way]], float)
+    x0, y0 = np.asarray(roads.town.lanes.origin, float)
+    return Pose(x + x0, y + y0, h)
