@@ -35,7 +35,7 @@ from limsim_jax.policies.language.driver import LanguageDriver, language
 from limsim_jax.policies.language.reading import read_description
 from limsim_jax.policies.language.rules import rule_action
 from limsim_jax.policies.language.scene import NONE, Facts, Neighbour, facts_of, numbers
-from limsim_jax.policies.language.store import read_answers, shares
+from limsim_jax.policies.language.store import Cache, read_answers, shares
 from limsim_jax.policies.registry import POLICIES
 from limsim_jax.sensors.rig import Lidar, Rig
 from limsim_jax.traffic.ego import Meta
@@ -391,3 +391,13 @@ def test_the_server_of_the_command_line(capsys, monkeypatch):
     for change, text in wrong.items():
         assert cli.main(["serve", "chat", change]) == 2
         assert text in capsys.readouterr().err
+
+
+def test_replies_are_written_when_the_cache_is_saved(tmp_path):
+    first, reply = Cache(tmp_path / "replies.db"), Reply("KEEP", prompt_tokens=10)
+    first.put("a", reply)
+    assert first.get("a") == reply and Cache(tmp_path / "replies.db").get("a") is None
+    first.put("a", Reply("LEFT"))  # the first reply stays
+    first.save()
+    again = Cache(tmp_path / "replies.db")
+    assert again.get("a") == reply and again.get("b") is None

@@ -10,13 +10,13 @@ from __future__ import annotations
 import asyncio
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -83,6 +83,9 @@ class _Spent:
 
     def __init__(self) -> None:
         self.calls = self.prompt_tokens = self.answer_tokens = 0
+
+
+_T = TypeVar("_T")
 
 
 class _UnknownReply(Exception):
@@ -301,9 +304,15 @@ class LanguageDriver:
                 found[question.key] = _Said(CallStatus.FALLBACK, None, [step])
             return found
 
-        # a thread of its own: the caller's may run an event loop already, as in a notebook
-        with ThreadPoolExecutor(1) as thread:
-            return thread.submit(lambda: asyncio.run(all_of_them())).result()
+        return self._in_thread(all_of_them)
+
+    def _in_thread(self, work: Callable[[], Coroutine[Any, Any, _T]]) -> _T:
+        """Do it in a thread of its own: the caller's may run an event loop already, as in a notebook."""
+        try:
+            with ThreadPoolExecutor(1) as thread:
+                return thread.submit(lambda: asyncio.run(work())).result()
+        finally:
+            self.cache.save()
 
     def _allowed(self) -> int:
         """Questions that the caps allow now."""
@@ -401,8 +410,8 @@ class LanguageDriver:
                         found.append(Memory(seed, row, answer.scene, reply.text))
             return found
 
-        with self._lock, ThreadPoolExecutor(1) as thread:
-            return thread.submit(lambda: asyncio.run(all_of_them())).result()
+        with self._lock:
+            return self._in_thread(all_of_them)
 
 
 def mistake(style: Style, scene: str, action: str) -> list[dict[str, Any]]:

@@ -24,16 +24,17 @@ def request_hash(request: Mapping[str, Any]) -> str:
 class Cache:
     """Replies by the hash of the request, in memory or SQLite.
 
-    Only replies are kept: a question that met an error is asked again.
+    Only replies are kept: a question that met an error is asked again. The file is written by `save`, for
+    many replies at once: each time waits for the disk.
 
     Args:
       path: of the file; None: this process only.
     """
 
-    __slots__ = ("_known", "_path")
+    __slots__ = ("_known", "_new", "_path")
 
     def __init__(self, path: Path | None) -> None:
-        self._path, self._known = path, dict[str, Reply]()
+        self._path, self._known, self._new = path, dict[str, Reply](), dict[str, Reply]()
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             with closing(sqlite3.connect(path)) as base, base:
@@ -51,9 +52,16 @@ class Cache:
     def put(self, key: str, reply: Reply) -> None:
         """Keep a reply; the first one of a request stays."""
         if self._known.setdefault(key, reply) is reply and self._path is not None:
-            with closing(sqlite3.connect(self._path)) as base, base:
-                row = key, json.dumps(asdict(reply), ensure_ascii=False)
-                base.execute("insert or ignore into replies values (?, ?)", row)
+            self._new[key] = reply
+
+    def save(self) -> None:
+        """Write what is new."""
+        if self._path is None or not self._new:
+            return
+        rows = [(key, json.dumps(asdict(reply), ensure_ascii=False)) for key, reply in self._new.items()]
+        with closing(sqlite3.connect(self._path)) as base, base:
+            base.executemany("insert or ignore into replies values (?, ?)", rows)
+        self._new.clear()
 
 
 @dataclass(frozen=True)
