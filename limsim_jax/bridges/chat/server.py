@@ -129,6 +129,7 @@ def _texts(content: Any) -> list[str]:
 
 class _Http(ThreadingHTTPServer):
     daemon_threads = True
+    request_queue_size = 128  # egos ask at once; with five, as is usual, the sixth waits a second
 
     def __init__(self, address: tuple[str, int], owner: ChatServer) -> None:
         self.owner = owner
