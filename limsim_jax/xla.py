@@ -142,13 +142,15 @@ def use_all_cores(cores: int | None = None) -> int:
     """Make every CPU core a device; return the number of devices.
 
     Why: XLA:CPU runs one program on about one core, so a batch is divided among devices. Once the backend
-    runs, the number of devices stays as it is.
+    runs, the number of devices stays as it is. XLA gets a further thread per device: a device that waits for
+    a function on the host holds one, and large arguments of the function need another to arrive.
 
     Args:
       cores: how many; None: all that this process may use.
     """
     if cores is None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    os.environ.setdefault("NPROC", str(2 * cores))  # threads of XLA:CPU, read once
     with contextlib.suppress(RuntimeError):  # the backend runs already
         jax.config.update("jax_num_cpu_devices", cores)
     return jax.local_device_count()
@@ -239,7 +241,7 @@ def load_program(name: str | None) -> Any:
 def held_program(name: str | None) -> Any:
     """As `load_program`; a program that this process has used is still there.
 
-    Why: a load takes seconds, and the memory of a program that nobody uses is not always given back.
+    Why: a load takes seconds, and the memory of a program out of use is not always given back.
     Gain: 45 scenarios of one shape share one program, where they ran out of memory mappings.
     """
     if name is None:

@@ -1,6 +1,8 @@
 """Every compiler trick does what it is for, in the compiled program or in the numbers."""
 
 import os
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -213,3 +215,32 @@ def test_programs_that_were_not_used_for_long_are_forgotten(folder, monkeypatch)
         for path in folder.iterdir():  # time passes
             os.utime(path, (path.stat().st_atime, path.stat().st_mtime - 10))
     assert [xla.load_program(name) is not None for name in "abc"] == [True, False, True]
+
+
+ASKS = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from limsim_jax.xla import use_all_cores
+
+assert use_all_cores(2) == 2
+mesh, many = Mesh(np.array(jax.local_devices()), ("worlds",)), PartitionSpec("worlds")
+
+
+def world(x):
+    def step(sum, _):
+        seen = jnp.broadcast_to(x[0] + sum, (20, 200, 1000))
+        told = jax.pure_callback(lambda y: np.asarray(y).mean(), jax.ShapeDtypeStruct((), jnp.float32), seen)
+        return sum + told / (x[0] + sum), None
+
+    return jax.lax.scan(step, jnp.float32(0), None, length=5)[0][None]
+
+
+run = jax.jit(jax.shard_map(world, mesh=mesh, in_specs=many, out_specs=many, check_vma=False))
+np.testing.assert_allclose(run(jnp.array([1.0, 2.0])), 5, rtol=1e-4)
+"""
+
+
+def test_all_devices_may_wait_for_the_host_at_once():
+    """Large arguments of a function on the host arrive although every device waits."""
+    plain = {name: x for name, x in os.environ.items() if name not in ("NPROC", "XLA_FLAGS")}
+    subprocess.run([sys.executable, "-c", ASKS], env=plain, check=True, timeout=120)
