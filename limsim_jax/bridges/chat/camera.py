@@ -8,6 +8,11 @@ from __future__ import annotations
 
 import base64
 import io
+import pickle
+import subprocess
+import sys
+import threading
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -61,14 +66,7 @@ class Camera:
                 "`limsim-jax train end-to-end --design camera` makes one that does not"
             )
 
-        def change(cameras: Any, ego: Any) -> Any:
-            inputs = blank_inputs()._replace(cameras=cameras[None], ego=ego[None])
-            said = Network(trained.design).apply({"params": trained.weights}, inputs)
-            assert isinstance(said, Outputs)
-            v = ego[None, EGO.index("speed")] * SPEED
-            return (target_speed(v, said.speed) - v)[0]
-
-        self._change = jax.jit(change)
+        self._weights, self._process, self._lock = str(weights), None, threading.Lock()
 
     def __call__(self, request: dict[str, Any]) -> str:
         """The answer to a question.
@@ -78,9 +76,51 @@ class Camera:
         """
         text, pictures = _asked(request)
         told, offered = read_description(text)
-        change = float(self._change(jnp.asarray(pictures), jnp.asarray(_own(told))))
+        change = self._change(pictures, _own(told))
         action = _action(change, told, offered)
         return decision(offered[action], f"the pictures ask for {change:+.1f} m/s")
+
+    def _change(self, pictures: NDArray[np.uint8], own: NDArray[np.float32]) -> float:
+        """The change of speed that the network asks for, m/s.
+
+        It runs in a process of its own: worlds that wait for an answer hold all threads of theirs.
+        """
+        with self._lock:
+            if self._process is None:
+                command = [sys.executable, "-m", __name__, self._weights]
+                self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+                weakref.finalize(self, _end, self._process)
+            assert self._process.stdin is not None and self._process.stdout is not None
+            pickle.dump((np.asarray(pictures), np.asarray(own)), self._process.stdin)
+            self._process.stdin.flush()
+            return pickle.load(self._process.stdout)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.communicate()
+
+
+def _answer_questions(weights: str) -> None:
+    """Answer questions on standard input, pictures and numbers, with changes of speed."""
+    trained, out = load_weights(weights), sys.stdout.buffer
+    sys.stdout = sys.stderr
+
+    @jax.jit
+    def change(cameras: Any, ego: Any) -> Any:
+        inputs = blank_inputs()._replace(cameras=cameras[None], ego=ego[None])
+        said = Network(trained.design).apply({"params": trained.weights}, inputs)
+        assert isinstance(said, Outputs)
+        v = ego[None, EGO.index("speed")] * SPEED
+        return (target_speed(v, said.speed) - v)[0]
+
+    while True:
+        try:
+            pictures, own = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        pickle.dump(float(change(jnp.asarray(pictures), jnp.asarray(own))), out)
+        out.flush()
 
 
 def _action(change: float, told: Facts, offered: dict[Meta, str]) -> Meta:
@@ -125,3 +165,7 @@ def _asked(request: dict[str, Any]) -> tuple[str, NDArray[np.uint8]]:
             f"pictures of {sizes}; expected {PICTURES} of {WIDTH} x {HEIGHT}, as cameras='driver' sends them"
         )
     return "\n".join(x["text"] for x in parts if x["type"] == "text"), np.stack(pictures)
+
+
+if __name__ == "__main__":
+    _answer_questions(sys.argv[1])
