@@ -44,7 +44,7 @@ def sweep(
     Args:
       experiment: an `Experiment`, the name of a bundled one, a TOML file, or a list of these.
       policies: values such as `PDMClosed()`, or names; None: the policy of each experiment. Two settings of
-        one planner need two names: `LimSimTM(simulations=50).named("tm50")`.
+        one planner need two names: `lj.named("tm50", lj.LimSimTM(simulations=50))`.
       seeds: how many, or which.
       out: folder of the results. It is made, or resumed: finished worlds do not run again. None: a
         temporary folder, which is removed with the results.
@@ -99,5 +99,5 @@ def _check_names(pairs: Sequence[tuple[str, str]]) -> None:
         if list(pairs).count((scenario, policy)) > 1:
             raise ValueError(
                 f"policies: '{policy}' stands twice in {scenario}; give one another name, as "
-                f'LimSimTM(...).named("other")'
+                f'lj.named("other", lj.LimSimTM(...))'
             )
