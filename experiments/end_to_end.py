@@ -146,8 +146,13 @@ def main() -> None:
     if options.ablations:
         policies |= ablations(options.out, options.minutes)
     file = RESULTS / "end_to_end.json"
-    found = json.loads(file.read_text()) if file.exists() else {"rows": []}
+    found: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"rows": []}
     kept = {(r["scenario"], r["driver"]): r for r in found["rows"]}
+    trained = found.get("ablations", {}) | {
+        name: {x: policies[name].trained.about[x] for x in ("seconds", "device", "steps", "rounds")}
+        for name in ABLATIONS
+        if name in policies
+    }
     for experiment, held_out in experiments():
         for name, driver in policies.items():
             if options.drivers and name not in options.drivers:
@@ -158,7 +163,7 @@ def main() -> None:
             one["device"] = jax.local_devices()[0].device_kind
             kept[experiment.name, name] = one
             print(json.dumps(one), flush=True)
-            found = {"about": about, "rows": list(kept.values())}
+            found = {"about": about, "ablations": trained, "rows": list(kept.values())}
             write_whole(file, json.dumps(found, indent=1) + "\n")
             head = "Regenerate: `python experiments/end_to_end.py`\n\n"
             write_whole(RESULTS / "end_to_end.md", f"{head}{end_to_end(found)}\n")

@@ -1,13 +1,14 @@
 """Language drivers: rules behind a chat server beside the same rules in JAX, and real models.
 
     python experiments/language.py [--seeds 8] [--horizon 40] [--experiments highway,intersection]
-    python experiments/language.py --full
+    python experiments/language.py --full [--experiments highway]
     python experiments/language.py --small-model [--seeds 3] [--horizon 60]
     python experiments/language.py --camera WEIGHTS [--seeds 20]
     python experiments/language.py --server URL --model NAME [--seeds 20]
 
 The first two show that descriptions and actions lose nothing: the model reads the text of a scene alone.
-`--full` has 100 seeds and whole episodes. They also run again from the cache, and with a latency of 0 s.
+`--full` has 100 seeds, whole episodes and five scenarios. The first 20 seeds also run again from the cache,
+and with a latency of 0 s.
 
 `--small-model` starts SmolLM2-135M on this machine (extra `llm-test`): a test of transport, schema and
 parsing with a real model. It cannot drive. `--camera` drives by pictures over the same protocol, with a small
@@ -33,6 +34,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from policies import summary
+from readme_tables import PAPER
 
 from limsim_jax.bridges.chat.camera import Camera
 from limsim_jax.bridges.chat.server import ChatServer
@@ -40,6 +43,7 @@ from limsim_jax.files import write_whole
 from limsim_jax.policies.language.answers import CallStatus
 from limsim_jax.policies.language.driver import language
 from limsim_jax.policies.language.rules import RuleTable
+from limsim_jax.policies.language.store import Answer
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import read_experiments
 from limsim_jax.sweeps.store import Outcome
@@ -47,14 +51,15 @@ from limsim_jax.xla import use_all_cores
 
 RESULTS = Path(__file__).parent / "results"
 SMALL_MODEL = "SmolLM2-135M-Instruct"
-FIGURES = ("success", "completion", "carla_score", "distance")
+AGAIN = 20
+"""Seeds that run again from the cache, and with a latency of 0 s."""
 SHARES = [f"language_{status.value}" for status in CallStatus]
 
 
 def main() -> None:
     """Run what the options ask for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--experiments", default="highway,intersection")
+    parser.add_argument("--experiments", help="names, with commas between")
     parser.add_argument("--seeds", type=int)
     parser.add_argument("--horizon", type=float, help="s; of the experiment with --full and --server")
     parser.add_argument("--full", action="store_true")
@@ -68,11 +73,11 @@ def main() -> None:
     if told.server and not told.model:
         parser.error("--server: which model? --model NAME or $LIMSIM_MODEL")
     use_all_cores()
-    names = told.experiments.split(",")
+    few = "highway,intersection" if not (told.full or told.camera) else ",".join(PAPER)
+    names = (told.experiments or few).split(",")
     if told.small_model:
         with small_model() as (url, model):
             row = real(names[:1], range(told.seeds or 3), told.horizon or 60.0, url, model, told.style)
-        row |= {"parsed": row["statuses"]["ok"] + row["statuses"]["repaired"]}
         keep(told.out, "small_model", row)
     elif told.camera:
         with ChatServer({"camera": Camera(told.camera)}) as server:
@@ -85,7 +90,8 @@ def main() -> None:
     else:
         count = told.seeds or (100 if told.full else 8)
         horizon = told.horizon or (None if told.full else 40.0)
-        keep(told.out, "rules", {name: beside(name, range(count), horizon) for name in names})
+        for name in names:
+            keep(told.out, "rules", {name: beside(name, range(count), horizon)})
 
 
 def worlds(name: str, horizon: float | None, policy: Any, chunk: int) -> Episodes:
@@ -98,16 +104,16 @@ def worlds(name: str, horizon: float | None, policy: Any, chunk: int) -> Episode
 
 def beside(name: str, seeds: Sequence[int], horizon: float | None) -> dict[str, Any]:
     """The rules behind a server beside the same rules in JAX."""
-    chunk = min(len(seeds), 20)
+    chunk = min(len(seeds), AGAIN)
     in_jax = whole(worlds(name, horizon, RuleTable(), chunk), seeds)
     with ChatServer() as server, tempfile.TemporaryDirectory() as folder:
         cache = str(Path(folder) / "replies.db")
         driver = worlds(name, horizon, language(server.url, "rules", cache=cache), chunk)
         over_chat, asked = whole(driver, seeds), len(server.requests)
-        again = whole(driver, seeds)
-        from_cache = len(server.requests) == asked and same(again, over_chat)
+        few, first = seeds[:chunk], over_chat[:1]
+        from_cache = same(whole(driver, few), first) and len(server.requests) == asked
         latent = worlds(name, horizon, language(server.url, "rules", latency=0.0, cache=cache), chunk)
-        zero = same(whole(latent, seeds), over_chat)
+        zero = same(whole(latent, few), first)
     return {
         "seeds": len(seeds),
         "horizon": driver.experiment.horizon,
@@ -116,6 +122,7 @@ def beside(name: str, seeds: Sequence[int], horizon: float | None) -> dict[str, 
         "distance_differs": differs(in_jax, over_chat, "distance"),
         "questions": int(np.nansum(joined(over_chat, "language_questions"))),
         "calls": asked,
+        "seconds_per_call": waited(over_chat),
         "statuses": statuses(over_chat),
         "actions": actions(over_chat),
         "from_cache_equal": from_cache,
@@ -134,26 +141,22 @@ def real(
 ) -> dict[str, Any]:
     """A real model in experiments."""
     found: dict[str, Any] = {}
-    outcomes: list[Outcome] = []
-    start = time.monotonic()
     for name in names:
+        start = time.monotonic()
         policy = language(url, model, style=style, timeout=120.0, cameras=cameras)
         one = worlds(name, horizon, policy, min(len(seeds), 20))
         some = whole(one, seeds)
-        outcomes += some
-        found[name] = figures(some) | {"seeds": len(seeds), "horizon": one.experiment.horizon}
-    answers = [x for outcome in outcomes for some in outcome.answers.values() for x in some if x.calls]
-    return {
-        "model": model,
-        "style": style,
-        "experiments": found,
-        "questions": int(np.nansum(joined(outcomes, "language_questions"))),
-        "statuses": statuses(outcomes),
-        "actions": actions(outcomes),
-        "seconds_per_call": float(np.mean([x.latency for x in answers])) if answers else None,
-        "tokens": sum(x.prompt_tokens + x.answer_tokens for x in answers),
-        "minutes": (time.monotonic() - start) / 60,
-    }
+        found[name] = figures(some) | {
+            "seeds": len(seeds),
+            "horizon": one.experiment.horizon,
+            "questions": int(np.nansum(joined(some, "language_questions"))),
+            "statuses": statuses(some),
+            "actions": actions(some),
+            "seconds_per_call": waited(some),
+            "tokens": sum(x.prompt_tokens + x.answer_tokens for x in asked_of(some)),
+            "minutes": (time.monotonic() - start) / 60,
+        }
+    return {"model": model, "style": style, "experiments": found}
 
 
 def whole(one: Episodes, seeds: Sequence[int]) -> list[Outcome]:
@@ -166,9 +169,21 @@ def joined(outcomes: Sequence[Outcome], name: str) -> np.ndarray:
     return np.concatenate([outcome.metrics[name] for outcome in outcomes])
 
 
-def figures(outcomes: Sequence[Outcome]) -> dict[str, float]:
-    """Means over worlds."""
-    return {name: float(np.nanmean(joined(outcomes, name))) for name in FIGURES}
+def figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Shares and means over worlds, with 95 % intervals; the mean distance, m."""
+    columns = {name: joined(outcomes, name) for name in outcomes[0].metrics}
+    return summary(columns) | {"distance": float(np.nanmean(columns["distance"]))}
+
+
+def asked_of(outcomes: Sequence[Outcome]) -> list[Answer]:
+    """Answers for which the server was asked."""
+    return [x for outcome in outcomes for some in outcome.answers.values() for x in some if x.calls]
+
+
+def waited(outcomes: Sequence[Outcome]) -> float | None:
+    """Mean time of a question, s."""
+    found = [x.latency for x in asked_of(outcomes)]
+    return float(np.mean(found)) if found else None
 
 
 def statuses(outcomes: Sequence[Outcome]) -> dict[str, float]:
@@ -221,9 +236,14 @@ def small_model() -> Iterator[tuple[str, str]]:
 
 
 def keep(out: Path, what: str, found: dict[str, Any]) -> None:
-    """Add to the results, and write the tables."""
+    """Add to the results, and write the tables; experiments that did not run stay."""
     path = out / "language.json"
     everything = json.loads(path.read_text()) if path.exists() else {}
+    old = everything.get(what, {})
+    if what == "rules":
+        found = old | found
+    else:
+        found["experiments"] = old.get("experiments", {}) | found["experiments"]
     everything[what] = found
     out.mkdir(parents=True, exist_ok=True)
     write_whole(path, json.dumps(everything, indent=1) + "\n")
@@ -252,19 +272,21 @@ def tables(everything: dict[str, Any]) -> str:
     if models:
         lines += [
             "",
-            "| model | experiment | seeds | s | success | route completion | driving score | ok | repaired | "
-            "rules drove | s per call |",
-            "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+            "| model | experiment | seeds | s | success, % | route completion, % | LimSim driving score "
+            "| ok, % | repaired, % | rules drove, % | s per question |",
+            "|---|---|---:|---:|---|---:|---:|---:|---:|---:|---:|",
         ]
     for row in models:
-        share = row["statuses"]
-        rest = sum(share[x] for x in ("timeout", "http", "fallback"))
-        wait = "" if row["seconds_per_call"] is None else f"{row['seconds_per_call']:.1f}"
         for name, one in row["experiments"].items():
+            share = one["statuses"]
+            rest = sum(share[x] for x in ("timeout", "http", "fallback"))
+            wait = "" if one["seconds_per_call"] is None else f"{one['seconds_per_call']:.2g}"
+            success, low, high = (100 * x for x in one["success"])
             lines.append(
-                f"| {row['model']} | {name} | {one['seeds']} | {one['horizon']:g} | {one['success']:.2f} | "
-                f"{one['completion']:.2f} | {one['carla_score']:.2f} | {100 * share['ok']:.1f} % | "
-                f"{100 * share['repaired']:.1f} % | {100 * rest:.1f} % | {wait} |"
+                f"| {row['model']} | {name} | {one['seeds']} | {one['horizon']:g} "
+                f"| {success:.1f} [{low:.1f}, {high:.1f}] | {100 * one['completion'][0]:.1f} "
+                f"| {one['score'][0]:.1f} | {100 * share['ok']:.1f} | {100 * share['repaired']:.1f} "
+                f"| {100 * rest:.1f} | {wait} |"
             )
     return "\n".join(lines) + "\n"
 

@@ -317,6 +317,13 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
     return "\n".join(rows)
 
 
+NETWORKS = (
+    "end-to-end", "without the filter", "with faults", "untrained", "the filter alone", "without LiDAR",
+    "without cameras", "waypoints", "without DAgger",
+)  # fmt: skip
+"""Rows of a scenario, in their order."""
+
+
 def end_to_end(result: dict[str, Any]) -> str:
     """Variants of the end-to-end driver by scenario, and its card."""
     rows = [
@@ -324,8 +331,10 @@ def end_to_end(result: dict[str, Any]) -> str:
         "| contact at fault, % | off the road, % |",
         "|---|---|---:|---|---:|---|---:|---:|",
     ]
-    order = {name: k for k, name in enumerate(PAPER)}
-    for r in sorted(result["rows"], key=lambda r: order.get(r["scenario"], len(order))):
+    order = {name: k for k, name in enumerate([*PAPER, *NETWORKS])}
+    last = len(order)
+    place = lambda r: (order.get(r["scenario"], last), r["scenario"], order.get(r["driver"], last))  # noqa: E731
+    for r in sorted(result["rows"], key=place):
         success, low, high = (100 * x for x in r["success"])
         score, least, most = r["score"]
         where = f"{r['scenario']}, held out" if r["held_out"] else r["scenario"]
@@ -347,7 +356,78 @@ def end_to_end(result: dict[str, Any]) -> str:
         f"of DAgger, {about['steps']:,} steps. Losses of held-out samples at the end: "
         f"{', '.join(f'{k} {v:g}' for k, v in last.items() if k not in ('s', 'phase', 'loss'))}.",
     ]
+    if others := result.get("ablations"):
+        said = (
+            f"{name} {r['seconds'] / 60:.0f} min on {r['device']}, {r['steps']:,} steps"
+            for name, r in others.items()
+        )
+        rows += ["", f"Networks that lack something: {'; '.join(said)}."]
     return "\n".join(rows)
+
+
+TITLES = {
+    "pdm_closed": "PDM-Closed",
+    "limsim_tm": "LimSim-TM",
+    "end_to_end": "end-to-end",
+    "rules": "rules, by chat",
+    "camera": "pictures, by chat",
+}
+"""Drivers of the table of the paper."""
+
+
+def drivers(result: dict[str, Any]) -> str:
+    """Five scenarios, all kinds of drivers; `result` has the times of decisions."""
+    rows = [
+        "| scenario | driver | seeds | success, % | route completion, % | LimSim driving score "
+        "| answered by the model, % |",
+        "|---|---|---:|---|---:|---|---:|",
+    ]
+    models = {
+        name: f"{name.removeprefix('model ')}, by chat" for name in read("language") if "model " in name
+    }
+    for scenario in PAPER:
+        for name, title in (TITLES | models).items():
+            r = _driver_row(name, scenario)
+            if r is None:
+                continue
+            success, low, high = (100 * x for x in r["success"])
+            score, least, most = r["score"]
+            share = r.get("statuses")
+            answered = "" if share is None else f"{100 * (share['ok'] + share['repaired']):.1f}"
+            rows.append(
+                f"| {scenario} | {title} | {r['seeds']:,} | {success:.1f} [{low:.1f}, {high:.1f}] "
+                f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}] | {answered} |"
+            )
+    rows += [
+        "",
+        "| driver | a decision of one world, ms | per vehicle in a batch, ms | compiled in, s |",
+        "|---|---:|---:|---:|",
+    ]
+    for name, r in result["decisions"].items():
+        rows.append(
+            f"| {TITLES[name]} | {r['decision_ms']:.2g} | {r['amortised_ms']:.2g} | {r['compile_s']:.0f} |"
+        )
+    for name, title in [(x, TITLES[x]) for x in ("rules", "camera")] + list(models.items()):
+        waits = [r["seconds_per_call"] for x in PAPER if (r := _driver_row(name, x)) is not None]
+        if waits:
+            rows.append(f"| {title}, per question | {1e3 * sum(waits) / len(waits):.2g} | | |")
+    devices = dict.fromkeys(r["device"] for r in result["decisions"].values())
+    return "\n".join([*rows, "", f"Timed in the roundabout on {' and '.join(devices)}."])
+
+
+def _driver_row(name: str, scenario: str) -> dict[str, Any] | None:
+    """How a driver drove in a scenario."""
+    if name == "rules":
+        one = read("language").get("rules", {}).get(scenario)
+        shared = ("seeds", "statuses", "seconds_per_call")
+        return None if one is None else one["over_chat"] | {x: one[x] for x in shared}
+    if name == "camera" or name not in TITLES:
+        key = "camera network" if name == "camera" else name
+        return read("language").get(key, {}).get("experiments", {}).get(scenario)
+    end_to_end_ = name == "end_to_end"
+    kind, said = ("driver", "end-to-end") if end_to_end_ else ("policy", name)
+    found = read("end_to_end" if end_to_end_ else "policies")["rows"]
+    return next((r for r in found if r["scenario"] == scenario and r[kind] == said), None)
 
 
 OUTCOMES = {
@@ -383,6 +463,7 @@ TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "area_of_interest": area_of_interest,
     "calibration": calibration,
     "closed_loop": closed_loop,
+    "drivers": drivers,
     "end_to_end": end_to_end,
     "maps_against_carla": carla,
     "maps_against_sumo": sumo,
