@@ -80,7 +80,7 @@ def test_it_says_what_the_network_says_of_the_pictures(weights):
         change = float(np.asarray(jax.nn.softmax(said.speed))[0] @ np.array(CHANGES))
         answer = model(question(facts(), pictures(seed)))
         assert f"{change:+.1f} m/s" in answer
-        texts.add(float(model._change(inputs.cameras[0], ego[0])))
+        texts.add(float(model._change(np.asarray(inputs.cameras[0]), np.asarray(ego[0]))))
     assert len(texts) == 3, "other pictures, other answers"
 
 
