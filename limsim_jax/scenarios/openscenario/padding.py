@@ -20,7 +20,7 @@ class Sizes(NamedTuple):
 
     entities: int = 4
     corridors: int = 2
-    points: int = 768
+    points: int = 896
     places: int = 2
     trajectories: int = 1
     vertices: int = 2
