@@ -9,7 +9,8 @@ from __future__ import annotations
 import itertools
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -292,14 +293,13 @@ def policies(result: dict[str, Any], few: bool = False) -> str:
     ]
     parts = [[row, row | row["few"]] if few and "few" in row else [row] for row in result["rows"]]
     for r in itertools.chain.from_iterable(parts):
-        (success, low, high), (score, least, most) = ([100 * x for x in r["success"]], r["score"])
         fault, _, bound = (100 * x for x in r["at_fault_contacts"])
         theirs = f" ({PAPER[r['scenario']]})" if r["policy"].startswith("limsim_tm") else ""
         took = "".join(f" {r[name]:.2g} |" if name in r else " |" for name in times)
         rows.append(
             f"| {r['scenario']} | {r['policy']} | {r['knows']} | {r['seeds']:,} "
-            f"| {success:.1f} [{low:.1f}, {high:.1f}] "
-            f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}]{theirs} "
+            f"| {bounded(r['success'], 100)} "
+            f"| {100 * r['completion'][0]:.1f} | {bounded(r['score'])}{theirs} "
             f"| {fault:.1f} (at most {bound:.1f}) | {100 * r['near_misses'][0]:.1f} "
             f"| {r['others_collided']} | {r.get('gridlocks', '')} |{took}"
         )
@@ -335,13 +335,11 @@ def end_to_end(result: dict[str, Any]) -> str:
     last = len(order)
     place = lambda r: (order.get(r["scenario"], last), r["scenario"], order.get(r["driver"], last))  # noqa: E731
     for r in sorted(result["rows"], key=place):
-        success, low, high = (100 * x for x in r["success"])
-        score, least, most = r["score"]
         where = f"{r['scenario']}, held out" if r["held_out"] else r["scenario"]
         theirs = INTERFUSER.get(r["scenario"]) if r["driver"] == "end-to-end" else None
         rows.append(
-            f"| {where} | {r['driver']} | {r['seeds']} | {success:.1f} [{low:.1f}, {high:.1f}] "
-            f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}]"
+            f"| {where} | {r['driver']} | {r['seeds']} | {bounded(r['success'], 100)} "
+            f"| {100 * r['completion'][0]:.1f} | {bounded(r['score'])}"
             f"{'' if theirs is None else f' ({theirs})'} "
             f"| {100 * r['at_fault_contacts'][0]:.1f} | {100 * r['off_road'][0]:.1f} |"
         )
@@ -382,21 +380,18 @@ def drivers(result: dict[str, Any]) -> str:
         "| answered by the model, % |",
         "|---|---|---:|---|---:|---|---:|",
     ]
-    models = {
-        name: f"{name.removeprefix('model ')}, by chat" for name in read("language") if "model " in name
-    }
+    asked = [name for name in read("language") if name.startswith("model ")]
+    models = {name: f"{name.removeprefix('model ')}, by chat" for name in asked}
     for scenario in PAPER:
         for name, title in (TITLES | models).items():
             r = _driver_row(name, scenario)
             if r is None:
                 continue
-            success, low, high = (100 * x for x in r["success"])
-            score, least, most = r["score"]
             share = r.get("statuses")
             answered = "" if share is None else f"{100 * (share['ok'] + share['repaired']):.1f}"
             rows.append(
-                f"| {scenario} | {title} | {r['seeds']:,} | {success:.1f} [{low:.1f}, {high:.1f}] "
-                f"| {100 * r['completion'][0]:.1f} | {score:.1f} [{least:.1f}, {most:.1f}] | {answered} |"
+                f"| {scenario} | {title} | {r['seeds']:,} | {bounded(r['success'], 100)} "
+                f"| {100 * r['completion'][0]:.1f} | {bounded(r['score'])} | {answered} |"
             )
     rows += [
         "",
@@ -488,8 +483,7 @@ def success(result: dict[str, Any]) -> str:
         cells = []
         for scenario in scenarios:
             (found,) = (r["success"] for r in rows if (r["scenario"], r["policy"]) == (scenario, policy))
-            share, low, high = (100 * x for x in found)
-            cells.append(f"{share:.1f} [{low:.1f}, {high:.1f}]")
+            cells.append(bounded(found, 100))
         lines.append(f"| `{policy}` | {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -507,6 +501,13 @@ def places() -> dict[Path, dict[str, str]]:
     return found
 
 
+def bounded(found: Sequence[float], scale: float = 1) -> str:
+    """An estimate with its interval."""
+    middle, low, high = (scale * x for x in found)
+    return f"{middle:.1f} [{low:.1f}, {high:.1f}]"
+
+
+@cache
 def read(name: str) -> dict[str, Any]:
     """A result."""
     return json.loads(_file(name).read_text(encoding="utf-8"))

@@ -198,7 +198,7 @@ def without_compilation_cache() -> Iterator[None]:
 
 
 def shared_program(name: str | None, compiled: Callable[[], Any]) -> Any:
-    """The program of a name, from disk or compiled; threads that want the same one wait for the first.
+    """The program of a name, held, from disk or compiled; threads that want the same one wait for the first.
 
     Args:
       name: see `load_program`; None: it is compiled.
@@ -207,8 +207,8 @@ def shared_program(name: str | None, compiled: Callable[[], Any]) -> Any:
     if name is None:
         return compiled()
     with _program_lock(name):
-        found = load_program(name)
-        return keep_program(name, compiled()) if found is None else found
+        found = held_program(name)
+        return hold_program(name, keep_program(name, compiled())) if found is None else found
 
 
 @functools.cache

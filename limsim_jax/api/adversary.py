@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from limsim_jax.api.experiment import Experiment, load_experiments
+from limsim_jax.api.experiment import Experiment, one_experiment
 from limsim_jax.api.progress import count_bar
+from limsim_jax.api.searched import Searched
 from limsim_jax.sweeps.adversary import LEAST_PLAUSIBLE, MOST, STARTS
 from limsim_jax.sweeps.adversary import Adversary as _Adversary
 from limsim_jax.sweeps.adversary import adversary as _adversary
@@ -14,29 +15,14 @@ from limsim_jax.sweeps.experiment import ExperimentError
 from limsim_jax.xla import use_all_cores
 
 if TYPE_CHECKING:
-    from limsim_jax.api.world import World
     from limsim_jax.policies.base import PolicyLike
 
 REFERENCE = "pdm_closed_rules"
 """Policy that drives the failures as well, unless told."""
 
 
-class Adversary(_Adversary):
+class Adversary(Searched, _Adversary):
     """Worlds in which a policy fails, no probability; it can replay them."""
-
-    def replay(self, number: int = 0, *, explain: bool = True) -> World:
-        """Run a failure again and keep every step; `number` is that of `failures`."""
-        from limsim_jax.api.world import World
-
-        if not 0 <= number < len(self.failures):
-            raise ValueError(f"failure {number}: there are {len(self.failures)}, from 0")
-        return World.run(self.episodes, number, explain=explain)
-
-    def _repr_html_(self) -> str:
-        import html
-
-        rows = "".join(f"<tr><td>{html.escape(a)}</td><td>{html.escape(b)}</td></tr>" for a, b in self.rows())
-        return f"<b>{html.escape(self.scenario)}, {html.escape(self.policy)}</b><table>{rows}</table>"
 
 
 def adversary(
@@ -85,14 +71,12 @@ def adversary(
       ResultsError: `out` holds something else, or a search that was made differently.
     """
     use_all_cores()
-    experiments = load_experiments(experiment)
-    if len(experiments) != 1:
-        raise ValueError(f"experiment: {len(experiments)} scenarios at once; search them one by one")
-    episodes = experiments[0].episodes(policy, chunk=chunk)
+    one = one_experiment(experiment, "search")
+    episodes = one.episodes(policy, chunk=chunk)
     other = None
     if reference is not None and episodes.egos:
         try:
-            other = experiments[0].episodes(reference, chunk=episodes.chunk)
+            other = one.episodes(reference, chunk=episodes.chunk)
         except ExperimentError as error:
             raise ExperimentError(f"reference: {error}") from None
     with count_bar(progress, f"{episodes.scenario} / {episodes.policy}") as tell:

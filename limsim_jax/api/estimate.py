@@ -5,34 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from limsim_jax.api.experiment import Experiment, load_experiments
+from limsim_jax.api.experiment import Experiment, one_experiment
 from limsim_jax.api.progress import count_bar
+from limsim_jax.api.searched import Searched
 from limsim_jax.sweeps.estimate import LEAST, Method
 from limsim_jax.sweeps.estimate import Estimate as _Estimate
 from limsim_jax.sweeps.estimate import estimate as _estimate
 from limsim_jax.xla import use_all_cores
 
 if TYPE_CHECKING:
-    from limsim_jax.api.world import World
     from limsim_jax.policies.base import PolicyLike
 
 
-class Estimate(_Estimate):
+class Estimate(Searched, _Estimate):
     """How probable an event is under a policy; it can replay worlds."""
-
-    def replay(self, number: int = 0, *, explain: bool = True) -> World:
-        """Run a world with the event again and keep every step; `number` is that of `failures`."""
-        from limsim_jax.api.world import World
-
-        if not 0 <= number < len(self.failures):
-            raise ValueError(f"failure {number}: there are {len(self.failures)}, from 0")
-        return World.run(self.episodes, number, explain=explain)
-
-    def _repr_html_(self) -> str:
-        import html
-
-        rows = "".join(f"<tr><td>{html.escape(a)}</td><td>{html.escape(b)}</td></tr>" for a, b in self.rows())
-        return f"<b>{html.escape(self.scenario)}, {html.escape(self.policy)}</b><table>{rows}</table>"
 
 
 def estimate(
@@ -80,10 +66,8 @@ def estimate(
       ResultsError: `out` holds an estimate that was made differently.
     """
     use_all_cores()
-    experiments = load_experiments(experiment)
-    if len(experiments) != 1:
-        raise ValueError(f"experiment: {len(experiments)} scenarios at once; estimate them one by one")
-    episodes = experiments[0].episodes(policy, chunk=chunk)
+    one = one_experiment(experiment, "estimate")
+    episodes = one.episodes(policy, chunk=chunk)
     with count_bar(progress, f"{episodes.scenario} / {episodes.policy}") as tell:
         found = _estimate(
             episodes, event, None if out is None else Path(out), method=method, worlds=worlds, runs=runs,

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from limsim_jax.api.map import Map, load_map
 from limsim_jax.maps import bundled_maps
 from limsim_jax.maps.network import MapError, Network
-from limsim_jax.scenarios.library.catalogue import scenario_file
+from limsim_jax.scenarios.library.catalogue import no_experiment
 from limsim_jax.sweeps import experiment as _file
 from limsim_jax.sweeps.experiment import (
     ActionTable,
@@ -271,11 +271,8 @@ def load_experiments(
     if isinstance(source, Experiment):
         return [source]
     if isinstance(source, str | Path):
-        if not Path(source).is_file() and scenario_file(source) is not None:
-            raise ExperimentError(
-                f"{source}: is a scenario of the library, and no experiment; lj.openscenario has its "
-                f"variants, and they run by limsim-jax sweep {source}"
-            )
+        if message := no_experiment(source):
+            raise ExperimentError(message)
         return [Experiment(file) for file in read_experiments(source)]
     return [experiment for one in source for experiment in load_experiments(one)]
 
@@ -323,3 +320,16 @@ def _number(x: float | None) -> float | None:
 
 
 __all__ = ["Action", "Ego", "Experiment", "Flow", "Obstacle", "Vehicle", "Zone", "load_experiments"]
+
+
+def one_experiment(experiment: Experiment | str | Path, do: str) -> Experiment:
+    """The only experiment.
+
+    Raises:
+      ValueError: there are several, to `do` one by one.
+      ExperimentError: it cannot be read.
+    """
+    experiments = load_experiments(experiment)
+    if len(experiments) != 1:
+        raise ValueError(f"experiment: {len(experiments)} scenarios at once; {do} them one by one")
+    return experiments[0]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from limsim_jax.api.experiment import Experiment, load_experiments
+from limsim_jax.api.experiment import Experiment, one_experiment
 from limsim_jax.api.progress import count_bar
 from limsim_jax.api.world import World
 from limsim_jax.files import write_whole
@@ -67,11 +67,9 @@ def exposure(
     for name, value in (("search", search), ("replays", replays)):
         if value < 0:
             raise ValueError(f"{name}: {value}; at least 0")
-    experiments = load_experiments(experiment)
-    if len(experiments) != 1:
-        raise ValueError(f"experiment: {len(experiments)} scenarios at once; look at them one by one")
+    one = one_experiment(experiment, "look at")
     use_all_cores()
-    episodes = experiments[0].episodes(policy, chunk=chunk)
+    episodes = one.episodes(policy, chunk=chunk)
     with count_bar(progress, f"{episodes.scenario} / {episodes.policy}") as tell:
         found, counter = _exposure(episodes, domain, chosen, search=search, tell=tell)
 

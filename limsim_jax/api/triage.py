@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from limsim_jax.api.experiment import Experiment, load_experiments
+from limsim_jax.api.experiment import Experiment, one_experiment
 from limsim_jax.api.progress import count_bar
 from limsim_jax.api.results import Results
 from limsim_jax.report.triage import HEAD, Cluster, Finding, clusters_of, rows_of, write_page
@@ -154,10 +154,7 @@ def sensitivity(
       ValueError: too few seeds, or an unknown metric; one line.
     """
     use_all_cores()
-    experiments = load_experiments(experiment)
-    if len(experiments) != 1:
-        raise ValueError(f"experiment: {len(experiments)} scenarios at once; look at them one by one")
-    episodes = experiments[0].episodes(policy, chunk=chunk)
+    episodes = one_experiment(experiment, "look at").episodes(policy, chunk=chunk)
     wanted = [x for x in METRICS if x in episodes.units] if metrics is None else list(metrics)
     with count_bar(progress, f"{episodes.scenario} / {episodes.policy}") as tell:
         found = _sensitivity(episodes, wanted, seeds=seeds, seed=seed, tell=tell)

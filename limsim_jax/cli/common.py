@@ -11,11 +11,22 @@ import typer
 
 if TYPE_CHECKING:
     from limsim_jax.maps.network import Network
+    from limsim_jax.sweeps.experiment import ExperimentFile
 
 MapArgument = Annotated[
     str, typer.Argument(metavar="FILE", help="Map file, gzipped or not, or the name of a bundled map.")
 ]
+ExperimentArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="EXPERIMENT", help="Experiment file (.toml, .sumocfg), or the name of a bundled one."
+    ),
+]
 JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON.")]
+DrivenByOption = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Drive the ego by this policy instead.")
+]
+ChunkOption = Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")]
 NoCacheOption = Annotated[bool, typer.Option("--no-cache", help="Read the map file itself; leave no trace.")]
 
 
@@ -56,6 +67,16 @@ def load(file: str, no_cache: bool) -> Network:
     from limsim_jax.maps import read_network
 
     return read_network(path(file), cache=not no_cache)
+
+
+def experiments_of(name: str, map_file: str | None = None, policy: str | None = None) -> list[ExperimentFile]:
+    """The experiments of a file, or of a name; one that is not known may be in the scenario library."""
+    from limsim_jax.scenarios.library.catalogue import no_experiment
+    from limsim_jax.sweeps.experiment import ExperimentError, read_experiments
+
+    if message := no_experiment(name):
+        raise ExperimentError(message)
+    return read_experiments(name, map_file=map_file, policy=policy)
 
 
 def window(text: str) -> tuple[float, float, float, float]:

@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from limsim_jax.cli.common import JsonOption, table, write_json
-from limsim_jax.cli.results import ExperimentArgument, PolicyOption, ResultsArgument, ScenarioOption
+from limsim_jax.cli.common import (
+    ChunkOption,
+    DrivenByOption,
+    ExperimentArgument,
+    JsonOption,
+    experiments_of,
+    table,
+    write_json,
+)
+from limsim_jax.cli.results import PolicyOption, ResultsArgument, ScenarioOption
 
 if TYPE_CHECKING:
     from limsim_jax.sweeps.experiment import ExperimentFile
@@ -104,16 +112,14 @@ def triage(
 
 def sensitivity(
     experiment: ExperimentArgument,
-    policy: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Drive the ego by this policy instead.")
-    ] = None,
+    policy: DrivenByOption = None,
     metrics: Annotated[
         str | None, typer.Option(metavar="A,B", help="Metrics.  [default: contacts, times, speeds]")
     ] = None,
     seeds: Annotated[
         int, typer.Option(help="Seeds of the traffic; each costs a world per parameter, and two.")
     ] = 40,
-    chunk: Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")] = None,
+    chunk: ChunkOption = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Page to write.  [default: results/NAME-sensitivity.html]"),
@@ -124,9 +130,8 @@ def sensitivity(
     from limsim_jax.api.experiment import Experiment
     from limsim_jax.api.triage import sensitivity as run
     from limsim_jax.files import check_writable
-    from limsim_jax.sweeps.experiment import read_experiments
 
-    one = _one(read_experiments(experiment, policy=policy), "EXPERIMENT")
+    one = _one(experiments_of(experiment, policy=policy), "EXPERIMENT")
     page = Path("results") / f"{one.name}-sensitivity.html" if out is None else out
     page.parent.mkdir(parents=True, exist_ok=True)
     check_writable(json_file, page)
@@ -141,9 +146,7 @@ def sensitivity(
 
 def adversary(
     experiment: ExperimentArgument,
-    policy: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Drive the ego by this policy instead.")
-    ] = None,
+    policy: DrivenByOption = None,
     event: Annotated[
         str, typer.Option(metavar="EVENT", help="What is looked for: contact, fault, or as min_ttc<1.")
     ] = "contact",
@@ -157,7 +160,7 @@ def adversary(
         float, typer.Option(help="Share of random worlds that are as unusual as a failure, at least.")
     ] = 0.01,
     seed: Annotated[int, typer.Option(help="The first plain world, and the seed of the searches.")] = 0,
-    chunk: Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")] = None,
+    chunk: ChunkOption = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Folder to write.  [default: results/NAME-adversary]"),
@@ -174,11 +177,10 @@ def adversary(
     from limsim_jax.api.adversary import adversary as run
     from limsim_jax.api.experiment import Experiment
     from limsim_jax.files import check_writable
-    from limsim_jax.sweeps.experiment import read_experiments
 
     if chunk is not None and chunk < 1:
         raise typer.BadParameter(f"{chunk}; at least 1", param_hint="--chunk")
-    one = _one(read_experiments(experiment, policy=policy), "EXPERIMENT")
+    one = _one(experiments_of(experiment, policy=policy), "EXPERIMENT")
     check_writable(json_file)
     folder = Path("results") / f"{one.name}-adversary" if out is None else out
     begin = time.perf_counter()
@@ -200,9 +202,7 @@ def adversary(
 
 def exposure(
     experiment: ExperimentArgument,
-    policy: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Drive the ego by this policy instead.")
-    ] = None,
+    policy: DrivenByOption = None,
     seeds: Annotated[int, typer.Option(min=1, help="How many worlds: seeds 0, 1, 2, ...")] = 50,
     dimensions: Annotated[
         str | None,
@@ -220,7 +220,7 @@ def exposure(
     replays: Annotated[
         int, typer.Option(min=0, help="Worlds with rare cells that are written as replays.")
     ] = REPLAYS,
-    chunk: Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")] = None,
+    chunk: ChunkOption = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Folder to write to.  [default: results/NAME-exposure]"),
@@ -234,9 +234,8 @@ def exposure(
     from limsim_jax.api.exposure import write
     from limsim_jax.files import check_writable
     from limsim_jax.metrics.domain import domain_of
-    from limsim_jax.sweeps.experiment import read_experiments
 
-    one = _one(read_experiments(experiment, policy=policy), "EXPERIMENT")
+    one = _one(experiments_of(experiment, policy=policy), "EXPERIMENT")
     names = None if dimensions is None else [name.strip() for name in dimensions.split(",")]
     bins = _edges(edges or [])
     domain_of(names, bins)

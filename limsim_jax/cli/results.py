@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from limsim_jax.cli.common import window
+from limsim_jax.cli.common import ChunkOption, DrivenByOption, ExperimentArgument, experiments_of, window
 from limsim_jax.cli.scenarios import is_scenario, sweep_scenarios
 
 if TYPE_CHECKING:
@@ -24,14 +24,6 @@ if TYPE_CHECKING:
     from limsim_jax.sweeps.runner import Progress
     from limsim_jax.sweeps.store import Results
 
-ExperimentArgument = Annotated[
-    str,
-    typer.Argument(
-        metavar="EXPERIMENT",
-        help="Experiment file (.toml, .sumocfg, .xosc, or a folder of .xosc), or the name of a bundled one, "
-        "or of a scenario of the library.",
-    ),
-]
 ResultsArgument = Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder that a sweep has written.")]
 ScenarioOption = Annotated[
     str | None, typer.Option(metavar="NAME", help="Scenario, where the results hold several.")
@@ -56,7 +48,14 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def sweep(
-    experiment: ExperimentArgument,
+    experiment: Annotated[
+        str,
+        typer.Argument(
+            metavar="EXPERIMENT",
+            help="Experiment file (.toml, .sumocfg, .xosc, or a folder of .xosc), or the name of a bundled "
+            "one, or of a scenario of the library.",
+        ),
+    ],
     seeds: Annotated[
         int | None,
         typer.Option(
@@ -75,10 +74,7 @@ def sweep(
         Path | None,
         typer.Option(metavar="DIR", help="Where results go.  [default: results/EXPERIMENT]"),
     ] = None,
-    policy: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Drive the ego by this policy instead."),
-    ] = None,
+    policy: DrivenByOption = None,
     map_file: Annotated[
         str | None, typer.Option("--map", metavar="MAP", help="Use this map, not that of the file.")
     ] = None,
@@ -92,7 +88,7 @@ def sweep(
             help="Stop once the interval of the metric (default: success) is within +- WIDTH.",
         ),
     ] = None,
-    chunk: Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")] = None,
+    chunk: ChunkOption = None,
     workers: Annotated[
         int | None, typer.Option(help="Number of Ray workers to run on (needs the extra 'ray').")
     ] = None,
@@ -225,7 +221,7 @@ def sweep(
         experiments: list[ExperimentFile] = []
     else:
         _refuse(in_sumo, "only with --engine sumo")
-        experiments = _named(experiment, map_file, policy)
+        experiments = experiments_of(experiment, map_file, policy)
     folder = Path("results") / Path(experiment).stem if out is None else out
     if event is not None:
         from limsim_jax.cli.rare import estimate
@@ -286,38 +282,24 @@ def sweep(
             raise typer.Exit(1)
 
 
-def _named(name: str, map_file: str | None, policy: str | None) -> list[ExperimentFile]:
-    """The experiments of a name; one that is not known may be close to a scenario of the library."""
-    from limsim_jax.scenarios.library.catalogue import close_to
-    from limsim_jax.sweeps.experiment import ExperimentError, bundled_experiments, read_experiments
-
-    close = [] if Path(name).is_file() or Path(name).stem in bundled_experiments() else close_to(name)
-    if close:
-        raise ExperimentError(f"{name}: no such file; in the scenario library there is {', '.join(close)}")
-    return read_experiments(name, map_file=map_file, policy=policy)
-
-
 def warm(
     experiment: ExperimentArgument,
-    policy: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Drive the ego by this policy instead.")
-    ] = None,
+    policy: DrivenByOption = None,
     map_file: Annotated[
         str | None, typer.Option("--map", metavar="MAP", help="Use this map, not that of the file.")
     ] = None,
-    chunk: Annotated[int | None, typer.Option(help="Worlds per call.  [default: as memory allows]")] = None,
+    chunk: ChunkOption = None,
 ) -> None:
     """Compile the programs of an experiment now; sweeps of any number of seeds then start at once."""
     from concurrent.futures import ThreadPoolExecutor, as_completed
 
     from limsim_jax.files import cache_directory
-    from limsim_jax.sweeps.experiment import read_experiments
     from limsim_jax.sweeps.runner import COMPILERS
 
     if chunk is not None and chunk < 1:
         raise typer.BadParameter(f"{chunk}; at least 1", param_hint="--chunk")
     begin = time.perf_counter()
-    made = build(read_experiments(experiment, map_file=map_file, policy=policy), chunk)
+    made = build(experiments_of(experiment, map_file, policy), chunk)
     with ThreadPoolExecutor(COMPILERS) as pool:
         jobs = {pool.submit(one.compile): one for one in made}
         for job in as_completed(jobs):

@@ -125,9 +125,8 @@ def is_scenario(name: str) -> bool:
     from limsim_jax.scenarios.library.catalogue import scenario_file
 
     path = Path(name)
-    if path.suffix.lower() == ".xosc" or (path.is_dir() and any(path.glob("*.xosc"))):
-        return True
-    return not path.is_file() and scenario_file(name) is not None
+    is_file = path.suffix.lower() == ".xosc" or (path.is_dir() and any(path.glob("*.xosc")))
+    return is_file or scenario_file(name) is not None
 
 
 def files_of(path: Path) -> list[Path]:

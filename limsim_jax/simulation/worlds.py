@@ -151,10 +151,7 @@ class Worlds:
                 kept, worlds = None, start.out_info
             name = None if self._advance_name is None else f"{self._advance_name} {_shapes(worlds)}"
             shared = self.lane_map, np.int32(0)
-            advance = held_program(name)
-            if advance is None:
-                compiled = lambda: self._advance_jit.lower(shared, worlds).compile()  # noqa: E731
-                advance = hold_program(name, shared_program(name, compiled))
+            advance = shared_program(name, lambda: self._advance_jit.lower(shared, worlds).compile())
             self._start = start if kept is None else hold_program(self._start_name, kept.result())
             self._advance = advance
         return self

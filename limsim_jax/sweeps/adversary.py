@@ -23,7 +23,6 @@ normals (`traffic.demand.draws.Layout`), and every array is a world that the pro
 
 from __future__ import annotations
 
-import io
 import math
 import time
 from collections.abc import Callable, Generator, Sequence
@@ -35,8 +34,7 @@ import numpy as np
 from cmaes import SepCMA
 from numpy.typing import NDArray
 
-from limsim_jax.files import write_whole
-from limsim_jax.sweeps.asked import Asked, Log, Tell
+from limsim_jax.sweeps.asked import Asked, Log, Tell, event_in
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.events import Event, event_of
 from limsim_jax.sweeps.numbered import names_of, vehicles_of
@@ -490,12 +488,7 @@ def adversary(
     tell: Tell | None = None,
 ) -> Adversary:
     """Search for worlds in which an event happens; see `api.adversary.adversary`."""
-    if not episodes.egos:
-        raise ValueError(f"{episodes.scenario}: ego: there is none, so no event of one; add an [ego]")
-    wanted = event_of(event, episodes.units)
-    layout = episodes.layout
-    if not layout.size:
-        raise ValueError(f"{episodes.scenario}: nothing is random in its worlds; one run says it all")
+    wanted, layout = event_in(episodes, event), episodes.layout
     _checked(layout.size, worlds, starts, most, least_plausible)
     if not 0 <= seed < 2**31 - worlds:
         raise ValueError(f"seed: {seed}; at least 0, and below 2^31")
@@ -551,12 +544,7 @@ def adversary(
         episodes=ask.show(values),
     )
     log.write({**result.as_json(), "ran_now": ask.ran, "seconds": round(time.perf_counter() - begin, 1)})
-    if out is not None and done:
-        names = list(episodes.units)
-        table = np.array([[failure.metrics[name] for name in names] for failure in result.failures])
-        data = io.BytesIO()
-        np.savez_compressed(data, values=values, names=names, metrics=table)
-        write_whole(out / "failures.npz", data.getvalue())
+    log.failures(values, [failure.metrics for failure in result.failures], list(episodes.units))
     return result
 
 

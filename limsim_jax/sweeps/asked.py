@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.files import write_whole
 from limsim_jax.sweeps.episode import Episodes
-from limsim_jax.sweeps.events import Event
+from limsim_jax.sweeps.events import Event, event_of
 from limsim_jax.sweeps.numbered import Numbered, policy_seeds
 from limsim_jax.sweeps.store import NOT_COMPARED, ResultsError
 
@@ -24,6 +24,20 @@ Tell = Callable[[int, int], None]
 
 KINDS = {"results.json": "a sweep", "estimate.json": "an estimate", "adversary.json": "an adversary"}
 """Files that say what a folder holds."""
+
+
+def event_in(episodes: Episodes, event: str) -> Event:
+    """The event that is looked for in worlds with random numbers.
+
+    Raises:
+      ValueError: no ego, an unknown event, or nothing random; one line.
+    """
+    if not episodes.egos:
+        raise ValueError(f"{episodes.scenario}: ego: there is none, so no event of one; add an [ego]")
+    wanted = event_of(event, episodes.units)
+    if not episodes.layout.size:
+        raise ValueError(f"{episodes.scenario}: nothing is random in its worlds; one run says it all")
+    return wanted
 
 
 class Log:
@@ -69,6 +83,20 @@ class Log:
         if self.folder is not None:
             text = json.dumps({"made_by": self._about, **found}, indent=1)
             write_whole(self.folder / self._name, (text + "\n").encode())
+
+    def failures(
+        self,
+        values: NDArray[np.float32],
+        metrics: Sequence[Mapping[str, float]],
+        names: Sequence[str],
+        **more: Any,
+    ) -> None:
+        """Keep worlds with the event, if there are any: random numbers `[M, D]`, and metrics by name."""
+        if self.folder is None or not len(values):
+            return
+        data, table = io.BytesIO(), np.array([[row[name] for name in names] for row in metrics])
+        np.savez_compressed(data, values=values, names=names, metrics=table, **more)
+        write_whole(self.folder / "failures.npz", data.getvalue())
 
     def batch(
         self, values: NDArray[np.float32], run: Callable[[], tuple[list[str], NDArray[np.float64]]]

@@ -11,7 +11,6 @@ a policy draws hangs on the array, too, so an array is a world that can be run a
 
 from __future__ import annotations
 
-import io
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,13 +20,12 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from limsim_jax.files import write_whole
 from limsim_jax.rare_events.estimate import LEAST_SAMPLES, RUNS, RareEvent, check_settings, rare_event
 from limsim_jax.rare_events.samplers import LEVEL
 from limsim_jax.statistics import Interval
-from limsim_jax.sweeps.asked import Asked, Log, Tell
+from limsim_jax.sweeps.asked import Asked, Log, Tell, event_in
 from limsim_jax.sweeps.episode import Episodes
-from limsim_jax.sweeps.events import Event, event_of
+from limsim_jax.sweeps.events import Event
 from limsim_jax.sweeps.numbered import names_of
 
 Method = Literal["subset", "crude", "cross-entropy"]
@@ -210,13 +208,8 @@ def estimate(
     tell: Tell | None = None,
 ) -> Estimate:
     """Estimate the probability of an event; see `api.estimate.estimate`."""
-    if not episodes.egos:
-        raise ValueError(f"{episodes.scenario}: ego: there is none, so no event of one; add an [ego]")
-    wanted = event_of(event, episodes.units)
+    wanted, layout = event_in(episodes, event), episodes.layout
     samples = worlds_per_level(worlds, method, least, runs)
-    layout = episodes.layout
-    if not layout.size:
-        raise ValueError(f"{episodes.scenario}: nothing is random in its worlds; one run says it all")
     check_settings(layout.size, method, samples, runs, least, None, level)
     settings = {
         "event": wanted.name, "method": method, "samples": samples, "runs": runs, "least": least,
@@ -245,12 +238,7 @@ def estimate(
         episodes=ask.show(values),
     )
     log.write({**done.as_json(), "ran_now": ask.ran, "seconds": round(seconds, 1)})
-    if out is not None and len(values):
-        names = list(episodes.units)
-        table = np.array([[row[name] for name in names] for row in metrics])
-        data = io.BytesIO()
-        np.savez_compressed(data, values=values, weights=weights, names=names, metrics=table)
-        write_whole(out / "failures.npz", data.getvalue())
+    log.failures(values, metrics, list(episodes.units), weights=weights)
     return done
 
 

@@ -166,6 +166,8 @@ def test_unknown_names_are_one_line(capsys):
         (["library", "--tag", "bus"], "tag 'bus': not known"),
         (["check", "cut_oot"], "in the scenario library there is cut_out"),
         (["sweep", "cut_oot"], "in the scenario library there is cut_out"),
+        (["exposure", "cut_oot"], "in the scenario library there is cut_out"),
+        (["adversary", "cut_out"], "is a scenario of the library, and no experiment"),
     ):
         assert cli.main(command) == 2
         told = capsys.readouterr().err

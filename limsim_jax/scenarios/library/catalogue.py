@@ -252,15 +252,27 @@ def entry(name: str) -> Entry:
 
 
 def scenario_file(name: str | Path) -> Path | None:
-    """The file of a scenario of our own, by its name; None: there is none of that name."""
+    """The file of a scenario of our own, by its name; None: no such name, or a file of the user has it."""
     bare = _bare(str(name))
     found = FOLDER / f"{bare}.xosc"
-    return found if bare in _own() and found.is_file() else None
+    return found if not Path(name).is_file() and bare in _own() and found.is_file() else None
 
 
-def close_to(name: str | Path) -> list[str]:
-    """Names of scenarios of our own that are like this one."""
-    return get_close_matches(_bare(str(name)), _own(), _CLOSE)
+def close_to(name: str | Path) -> str | None:
+    """What to say of a file that is not there; None: no scenario of our own has a name like it."""
+    close = get_close_matches(_bare(str(name)), _own(), _CLOSE)
+    return f"{name}: no such file; in the scenario library there is {', '.join(close)}" if close else None
+
+
+def no_experiment(name: str | Path) -> str | None:
+    """Why a name is no experiment: it is in the library, or close to a name there; None: it may be one."""
+    if scenario_file(name) is not None:
+        return (
+            f"{name}: is a scenario of the library, and no experiment; lj.openscenario has its "
+            f"variants, and they run by limsim-jax sweep {name}"
+        )
+    path = Path(name)
+    return None if path.is_file() or path.stem in bundled_experiments() else close_to(name)
 
 
 def drivers() -> tuple[str, ...]:

@@ -266,9 +266,7 @@ def _file(path: Path) -> Path:
     """The file, or that of the library."""
     from limsim_jax.scenarios.library.catalogue import close_to, scenario_file
 
-    if path.is_file():
-        return path
     found = scenario_file(path)
-    if found is None and not path.exists() and (close := close_to(path)):
-        raise OpenScenarioError(f"{path}: no such file; in the scenario library there is {', '.join(close)}")
+    if found is None and not path.exists() and (message := close_to(path)):
+        raise OpenScenarioError(message)
     return path if found is None else found

@@ -183,12 +183,12 @@ def _starts(built: Built, roads: Roads, order: list[int], slots: int) -> tuple[A
         lane[k], s[k], d[k] = row, spot.s + length / 2, spot.d
         leads = (next_lane[row] >= 0) | is_goal[row]
         cost = np.where(leads, distance[row], distance[row] + 1e7)
-        goal[k] = int(np.argmin(cost))
         end = roads.nearest(_end_of_way(built, roads, entity))
         if end is not None:  # the way out at the end of its way, if it can get there
             there = rows[end.lane.id]
-            beyond = np.where(leads & ((next_lane[there] >= 0) | is_goal[there]), distance[there], np.inf)
-            goal[k] = int(np.argmin(beyond)) if np.isfinite(beyond).any() else goal[k]
+            beyond = leads & ((next_lane[there] >= 0) | is_goal[there])
+            cost = np.where(beyond, distance[there], np.inf) if beyond.any() else cost
+        goal[k] = int(np.argmin(cost))
     return lane, s, d, v, goal, active
 
 
