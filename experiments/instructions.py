@@ -65,10 +65,6 @@ WORK = (
     "An aggressive driver cuts in 8 m ahead of us",
     "The ego drives at 70 km/h on a rural road. The vehicle in front brakes in an emergency",
     "A car follows the ego closely on the motorway in dense traffic",
-)
-"""Instructions that were known while the grammar was written."""
-
-APART = (
     "While the ego is cruising at 28 m/s on a highway, a van cuts in 20 m ahead, then slows down to 20 m/s",
     "Heavy rain on the motorway: a lorry brakes hard in front of us",
     "In the city at 40 km/h, the bus ahead comes to a halt",
@@ -89,6 +85,30 @@ APART = (
     "A pallet lies in our lane 120 m ahead of the ego at 90 km/h",
     "A car is close behind the ego at 33 m/s on a quiet motorway",
     "A bus pulls out in front of the ego in the city",
+)
+"""Instructions that were known while the grammar was written."""
+
+APART = (
+    "A delivery van pulls into our lane 12 m ahead of the ego on a motorway and then brakes hard",
+    "On a dry three-lane motorway a lorry in front of the ego slows to 15 m/s",
+    "The vehicle ahead makes an emergency stop in the city",
+    "A motorbike overtakes us at 40 m/s and cuts in with a gap of 10 m",
+    "Two vans stand in the ego's lane on a country road",
+    "The ego drives at 30 m/s on a motorway with heavy traffic and the car ahead brakes with 5 m/s2",
+    "A car from the left crosses the intersection without yielding",
+    "The ego turns left at a crossroads while a truck comes towards it",
+    "In a roundabout a bus enters from the right",
+    "A fast sedan approaches the ego from behind in the left lane and passes",
+    "A car joins the motorway from the on-ramp 30 m in front of the ego at 20 m/s",
+    "It is raining; a taxi brakes abruptly 25 m in front of us in town",
+    "A slow tractor drives in front of the ego on a rural road",
+    "An SUV changes to the right lane 15 m ahead of the ego on the highway",
+    "A coach brakes gently to a standstill on a four-lane motorway",
+    "A car runs a red light from the right at a signalised intersection",
+    "There is an obstacle in the ego's lane 80 m ahead at 50 km/h in the city",
+    "The lead truck leaves its lane and a stopped car is 60 m ahead of it",
+    "A tailgating van follows the ego at 25 m/s on a highway",
+    "On an icy motorway the car in front slows down to 10 m/s, then speeds up to 20 m/s",
 )
 """Instructions that were written apart."""
 

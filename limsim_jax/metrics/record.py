@@ -22,13 +22,13 @@ from limsim_jax.traffic.collision import CLEARANCE, level, off_road
 from limsim_jax.traffic.ego import arrived
 from limsim_jax.traffic.engine import Tick
 from limsim_jax.traffic.motion import boxes
+from limsim_jax.traffic.signals import crosses_on_red
 from limsim_jax.types import Config, State, Status
 
 AT_RED = 15.0
 """m before a red light within which a standing ego waits for it."""
 
 _STANDS = 0.5  # m/s
-_ON_LINE = 0.5  # m beyond the stop line: an ego that starts from there has crossed it before
 
 
 class Snapshot(NamedTuple):
@@ -167,17 +167,15 @@ def _signals(
     state, dx, table = snapshot.state, snapshot.dx, lane_map.conflicts
     lane, s, v = state.lane[slot], state.s[slot], state.v[slot]
     red = lane_states(lane_map.signals, state.lights.phase) == SignalState.RED
-    # the lane that was entered in this step, and how the one before was left
+    # the lane that was entered in this step
     entered = state.active & (state.previous != NO_LANE) & (state.s <= dx) & (dx > 0)
-    before_line = state.s - dx + lane_map.length[state.previous]
-    before_line = before_line <= lane_map.stop_s[state.previous] + _ON_LINE
     signed = table.must_stop[table.connector[lane]]
     # a vehicle in the junction after crossing on red has no right of way
     ran = ((state.status & int(Status.RED_LIGHT)) != 0) & (lane_map.junction[state.lane] >= 0)
     wrong = (state.status & int(Status.WRONG_WAY)) != 0
     waits = red[following] & (v < _STANDS) & (lane_map.stop_s[lane] - s < AT_RED)
     return _Signals(
-        red_light=entered[slot] & red[lane] & before_line[slot],
+        red_light=crosses_on_red(lane_map, state, dx)[slot],
         stop_sign=entered[slot] & signed,
         waits=waits,
         violation=ran | wrong,

@@ -17,7 +17,10 @@ from numpy.typing import NDArray
 Columns = Mapping[str, NDArray[np.float64]]
 
 FAR = 10.0
-"""s, time to collision from which on the distance to others counts instead."""
+"""s, time to collision from which on the distance to others alone counts."""
+
+PACE = 10.0
+"""m/s, what turns the least distance to others into s."""
 
 FARTHEST = 1e3
 """Limit state of a world in which nothing leads to the event."""
@@ -49,10 +52,14 @@ class Event:
 
 
 def _urgency(columns: Columns) -> NDArray[np.float64]:
-    """s: least time to collision, beyond `FAR` a tenth of the least distance in m on top."""
+    """s: least time to collision, and the least distance on top.
+
+    Vehicles that pass side by side have a time to collision of 0 for long; the distance tells them apart.
+    """
     ttc, distance = columns["min_ttc"], columns["min_distance"]
-    far = FAR + np.where(np.isnan(distance), FARTHEST, distance) / 10
-    return np.where(ttc < FAR, np.maximum(ttc, 1e-6), far)
+    ttc = np.where(ttc < FAR, ttc, FAR)  # absent: nothing ever came near
+    distance = np.where(np.isnan(distance), FARTHEST, distance)
+    return np.maximum(ttc + distance / PACE, 1e-6)
 
 
 def _contact(columns: Columns) -> NDArray[np.float64]:

@@ -17,8 +17,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, room_beside
 from limsim_jax.maps.routing import NO_ROOM
-from limsim_jax.maps.signal_table import SignalState
-from limsim_jax.maps.signals import lane_states
 from limsim_jax.traffic.bodies import tails
 from limsim_jax.traffic.car_following import ACC, NO_GAP, CarFollowing, desired_speed
 from limsim_jax.traffic.collision import AfterCollision, after_collision
@@ -65,7 +63,7 @@ from limsim_jax.traffic.script import (
     with_grip,
     without_speed,
 )
-from limsim_jax.traffic.signals import switch
+from limsim_jax.traffic.signals import crosses_on_red, switch
 from limsim_jax.traffic.speeds import BEND_POINTS, bend_squares, lane_speed
 from limsim_jax.types import Actions, Config, Schedule, State, Status
 from limsim_jax.xla import computed_once, mapped_like
@@ -397,8 +395,8 @@ def drive(
         tick = Tick(state, box, left, off, config.time(state.step), decision, x, dx, command)
         return (bare(state), x), record(tick)
 
-    before, x = state, mapped_like(state.s, jnp.zeros_like(state.s))
-    (state, _), records = lax.scan(step, (bare(state), x), None, length=config.decision_every)
+    x = mapped_like(state.s, jnp.zeros_like(state.s))
+    (state, x), records = lax.scan(step, (bare(state), x), None, length=config.decision_every)
     state = replace(state, **fixed)
     if script is not None:
         state = replace(state, driver=replace(dry, lane_change_time=state.driver.lane_change_time))
@@ -406,7 +404,8 @@ def drive(
         state, _ = record_events(config, lane_map, state, boxes(lane_map, state), free=free)
     if state.egos.slot.shape[0]:
         state = sync(lane_map, state, boxes(lane_map, state))
-    return _ran_red(lane_map, state, before), records
+    ran = crosses_on_red(lane_map, state, x)
+    return replace(state, status=state.status | jnp.where(ran, int(Status.RED_LIGHT), 0)), records
 
 
 def _step(
@@ -496,13 +495,3 @@ def _control(
     else:  # hands off
         return state, Control(acceleration=still, steering=still)
     return hold_and_brake(limits, state, control, broken)
-
-
-def _ran_red(lane_map: LaneMap, state: State, before: State) -> State:
-    """Record vehicles that have crossed a stop line on red."""
-    red = lane_states(lane_map.signals, state.lights.phase) == SignalState.RED
-    ran = (
-        state.active & (state.lane != before.lane) & red[state.lane]
-    )  # there are no lane changes behind a light
-    ran &= before.s <= lane_map.stop_s[before.lane] + 0.5  # from beyond the line it is no crossing
-    return replace(state, status=state.status | jnp.where(ran, int(Status.RED_LIGHT), 0))

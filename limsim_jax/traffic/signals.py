@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.maps.lane_map import LaneMap
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import lane_states, phase_at
 from limsim_jax.types import Config, Lights, State
@@ -21,6 +21,9 @@ GAP = 3.0
 
 DETECTOR = 40.0
 """m before the stop line in which vehicles keep an actuated light green."""
+
+ON_LINE = 0.5
+"""m beyond a stop line where a front bumper has not crossed it yet."""
 
 
 @jax.named_scope("lights")
@@ -61,3 +64,24 @@ def switch(
         elapsed=jnp.where(start | jnp.where(actuated, over, new != now), 0, elapsed),
         gap=jnp.where(actuated & ~over, gap, 0),
     )
+
+
+def crosses_on_red(lane_map: LaneMap, state: State, dx: Float[Array, " N"]) -> Bool[Array, " N"]:
+    """Vehicles whose front has come over a stop line at red in the last `dx` m.
+
+    The line may stand well before the end of its lane: what counts is the light when the front passes the
+    line, not when the vehicle enters the junction.
+
+    Args:
+      lane_map: where.
+      state: after the way.
+      dx: m driven.
+    """
+    entered = (state.previous != NO_LANE) & (state.s <= dx)
+    lane = jnp.where(entered, state.previous, state.lane)
+    onto = jnp.where(entered, state.lane, lane_map.routes.next_lane[state.lane, state.goal])
+    front = state.s + jnp.where(entered, lane_map.length[lane], 0)
+    line = lane_map.stop_s[lane] + ON_LINE
+    red = lane_states(lane_map.signals, state.lights.phase) == SignalState.RED
+    crossed = state.active & (front - dx <= line) & (front > line) & (lane != NO_LANE)
+    return crossed & (onto != NO_LANE) & red[onto]

@@ -135,13 +135,19 @@ def shows(state):
 def test_crossing_a_stop_line_on_red():
     told = []
     for _, state, tick, slot, found in each("red_light"):
-        expected = False
-        if entered(state, tick, slot):
-            before = state.previous[slot]
-            was = host().length[before] + state.s[slot] - tick.dx[slot]  # on that lane, a step ago
-            crossed = was <= host().stop_s[before] + 0.5
-            expected = crossed and shows(state)[state.lane[slot]] == SignalState.RED
-            told.append((expected, crossed))
+        lane, onto, front = state.lane[slot], NO_LANE, state.s[slot]
+        if lane == NO_LANE or not state.active[slot]:
+            assert not found
+            continue
+        if state.previous[slot] != NO_LANE and state.s[slot] <= tick.dx[slot]:  # entered in this step
+            lane, onto = state.previous[slot], lane
+            front = host().length[lane] + front
+        else:
+            onto = host().routes.next_lane[lane, state.goal[slot]]
+        line = host().stop_s[lane] + 0.5
+        crossed = front - tick.dx[slot] <= line < front
+        expected = crossed and onto != NO_LANE and shows(state)[onto] == SignalState.RED
+        told.append((expected, crossed))
         assert found == expected
     assert 3 < sum(red for red, _ in told) < sum(crossed for _, crossed in told) < len(told)
 

@@ -132,15 +132,18 @@ def test_a_brief_replay_is_the_beginning_of_the_whole_one(monkeypatch):
 @pytest.mark.parametrize("policy, seed", cases())
 def test_lights_crossed_on_red(policy, seed):
     _, lane_map, trace, ego, _, metrics, _ = replayed(policy, seed)
-    crossed = 0
+    egos, crossed = episodes(policy)._egos, 0
+    assert egos is not None and egos.goal is not None
     for t in range(1, len(trace.time)):
-        if not trace.active[t, ego] or trace.lane[t, ego] == trace.lane[t - 1, ego]:
+        if not trace.active[t, ego]:
             continue
+        before, lane = trace.lane[t - 1, ego], trace.lane[t, ego]
+        line = float(lane_map.stop_s[before]) + 0.5
+        entered = lane != before and trace.s[t, ego] < 5  # not a lane change
+        front = trace.s[t, ego] + (float(lane_map.length[before]) if entered else 0)
+        onto = lane if entered else lane_map.routes.next_lane[lane, egos.goal[0]]
         shows = np.asarray(lane_states(lane_map.signals, trace.phase[t]))
-        before = trace.lane[t - 1, ego]
-        handed_over = trace.s[t, ego] < 5  # not a lane change
-        near = trace.s[t - 1, ego] <= float(lane_map.stop_s[before]) + 0.5
-        crossed += bool(shows[trace.lane[t, ego]] == SignalState.RED and handed_over and near)
+        crossed += bool(trace.s[t - 1, ego] <= line < front and shows[onto] == SignalState.RED)
     assert metrics["red_lights"] == crossed
     if policy == "like_traffic":
         assert crossed == 0

@@ -30,7 +30,7 @@ from limsim_jax.traffic.right_of_way.stops import stop_signs, stops_at_lights
 from limsim_jax.traffic.signals import DETECTOR, GAP, switch
 from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import default_population
-from limsim_jax.types import Config, Lights
+from limsim_jax.types import Config, Lights, Status
 
 pytestmark = pytest.mark.engine
 
@@ -495,6 +495,19 @@ def test_red_lights_are_obeyed_and_green_discharges_the_queue():
     headway = headway[headway < 10]
     assert 3600 / headway.mean() == pytest.approx(1700, rel=0.12)
     assert s[at == lane].max() <= length + 0.01
+
+
+def test_running_a_red_light_is_told_where_the_line_stands_well_before_the_junction():
+    """One vehicle cannot stop any more, one is beyond the line when the world begins, one stands on it."""
+    _, lane_map = bundled("intersection")
+    shown = np.asarray(lane_map.signals.lane_program) >= 0
+    ways = [way for way in straight_on(lane_map) if shown[int(lane_map.routes.next_lane[way])]][:3]
+    lanes, goals = zip(*ways, strict=True)
+    line = np.asarray(lane_map.stop_s)[list(lanes)]
+    assert (np.asarray(lane_map.length)[list(lanes)] - line > 5).all(), "otherwise this tests little"
+    state = state_of("intersection", lanes, list(line + np.array([-2.0, 2.0, 0.3])), [13.0, 13.0, 0.0], goals)
+    end, _ = runner(True, 10)(state)
+    assert [(int(x) & int(Status.RED_LIGHT)) > 0 for x in np.asarray(end.status)[:3]] == [True, False, False]
 
 
 def test_capacity_of_a_minor_stream_falls_with_the_major_flow_as_siegloch_has_it():

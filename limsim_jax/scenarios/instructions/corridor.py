@@ -228,6 +228,22 @@ def signalled(meeting: Meeting) -> bool:
     return Control.SIGNAL in (meeting.ego.movement.control, meeting.other.movement.control)
 
 
+def light_at(network: Network, movement: Movement, time: float) -> str | None:
+    """The letter of SUMO that a movement is shown `time` s after the start; None: it has no light.
+
+    Actuated lights are taken to run their nominal durations, as they do until vehicles change them.
+    """
+    if movement.program is None or movement.link is None:
+        return None
+    program = network.programs[movement.program]
+    into = (time - program.offset) % sum(phase.duration for phase in program.phases)
+    for phase in program.phases:
+        into -= phase.duration
+        if into < 0:
+            return phase.state[movement.link]
+    return program.phases[-1].state[movement.link]
+
+
 def _approach(town: Map, lane: Lane, *, through: bool = False) -> Corridor:
     """The lanes that lead to a lane without a choice.
 

@@ -323,9 +323,10 @@ _LANE_CHANGES: tuple[tuple[str, Effect], ...] = (
 )  # fmt: skip
 
 _SPEEDS: tuple[tuple[str, Effect], ...] = (
-    (rf"(?:{HOW} )?(?:{verbs('brake', 'decelerate')}|{verbs('slow')} down|slams on the brakes|"
-     r"(?:does|performs|makes) an? (?:emergency|full) (?:stop|brake|braking)|emergency[- ]brakes|"
-     rf"brakes in an emergency)(?:,? (?:very )?{HOW})*"
+    (rf"(?:{HOW} )?(?:brak(?:es?|ing) in an emergency|{verbs('brake', 'decelerate')}|slows(?: down)?|"
+     rf"slow(?:ing)? down|{verbs('slam', 'hit', 'stamp')} (?:on )?the brakes?|"
+     r"(?:does|performs|makes) an? (?:emergency|full) (?:stop|brake|braking)|emergency[- ]brakes)"
+     rf"(?:,? (?:very )?{HOW})*"
      r"(?: (?:down )?to an? (?:full |complete )?(?:stop|standstill|halt))?", brake),
     (r"(?:down )?to an? (?:full |complete )?(?:stop|standstill|halt)", of_act("speed", lambda _: 0.0)),
     (rf"(?:{verbs('stop')}|comes? to an? (?:stop|halt|standstill))", act("stop")),
@@ -385,9 +386,10 @@ _SCENE: tuple[tuple[str, Effect], ...] = (
     (rf"(?:{verbs('enter')} )?(?:a |the )?(?:roundabout|traffic circle)", scene(road="roundabout")),
     (r"(?:from |on |onto |at )?(?:an? |the )?(?:on-?ramp|ramp|slip road|acceleration lane)",
      scene(road="ramp")),
-    (r"wet|rainy|slippery|in (?:the |heavy )?rain", scene(friction=WET)),
-    (r"snowy|snow-covered|in snow|on snow|snow", scene(friction=SNOW)),
-    (r"icy|on ice|ice", scene(friction=ICE)),
+    (r"wet|rainy|slippery|(?:in |with )?(?:the |heavy |light |pouring )?rain(?:fall|ing|s)?|drizzle",
+     scene(friction=WET)),
+    (r"(?:in |on )?(?:snowy|snow-covered|snow(?:fall|ing|s)?(?: covers)?)", scene(friction=SNOW)),
+    (r"(?:on )?(?:icy|black ice|ice(?: covers)?)", scene(friction=ICE)),
     (r"(?:in |with )?(?:busy|dense|heavy|rush[- ]hour)(?: traffic)?", scene(traffic="dense")),
     (r"(?:in |with )?(?:moderate|normal|medium)(?: traffic)?", scene(traffic="moderate")),
     (r"(?:in |with )?(?:light|sparse|little|quiet)(?: traffic)?", scene(traffic="light")),
@@ -401,7 +403,7 @@ _FILLERS: tuple[tuple[str, Effect], ...] = (
     (r"(?:an?|the|and|then|but|with|on|at|in|of|to|for|so|there|is|are|was|has|while|when|as|after|suddenly|"
      r"abruptly|roads?|lanes?|straight|dry|scenario|where|its|our|by|from|very|also|just|sharply|closely|both|"
      r"ahead|in front|way|path|onto|into|over|immediately|unexpectedly|traffic|again|during|please|simulate|"
-     r"show|create|test)", nothing),
+     r"show|create|test|appears?|shows up|becomes visible|comes into (?:view|sight)|path|across)", nothing),
 )  # fmt: skip
 
 PHRASES = tuple(

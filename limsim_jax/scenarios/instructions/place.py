@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from limsim_jax.maps.map import Map
 from limsim_jax.maps.network import Turn
 from limsim_jax.scenarios.instructions.corridor import (
@@ -16,6 +18,7 @@ from limsim_jax.scenarios.instructions.corridor import (
     Merge,
     Way,
     corridors,
+    light_at,
     meetings,
     merges,
     signalled,
@@ -37,6 +40,15 @@ HORIZON, AT_LIGHTS = 25.0, 60.0
 
 MEET = 7.0
 """s after the start at which two vehicles meet at a junction or a ramp."""
+
+MEETS = (MEET, MEET + 2, MEET + 4, MEET - 2, MEET - 3)
+"""s, moments at which they may meet, in the order in which they are tried."""
+
+SLOWEST = 5.0
+"""m/s of a vehicle on its way to a red light, at least."""
+
+GREEN = 3.0
+"""s for which the ego has had a green light when a vehicle runs the red one: it need not brake for it."""
 
 DENSITY = {"none": 0.0, "light": 4.0, "moderate": 10.0, "dense": 20.0}
 """Vehicles per km of lane: on a motorway, levels of service A, B to C, and E (HCM, exhibit 12-15)."""
@@ -159,8 +171,11 @@ def _meets(intent: Intent, found: Meeting) -> bool:
                 wanted = "ahead" if actor.place == "oncoming" else act.side
                 if (wanted is None and found.comes_from == "ahead") or wanted not in (None, found.comes_from):
                     return False
-    runs = any(act.kind == "run_red" for actor in intent.actors for act in actor.acts)
-    return not runs or signalled(found)
+    return not _runs_red(intent) or signalled(found)
+
+
+def _runs_red(intent: Intent) -> bool:
+    return any(act.kind == "run_red" for actor in intent.actors for act in actor.acts)
 
 
 def _on(intent: Intent, spot: Corridor | Meeting | Merge, tuning: Tuning) -> Placed:
@@ -295,12 +310,14 @@ def _at_junction(intent: Intent, spot: Meeting, tuning: Tuning) -> Placed:
     v = own_speed(intent, min(spot.ego.approach.limit, spot.other.approach.limit))
     if None in [way.goal(town) for way in (spot.ego, spot.other)]:
         raise _NoRoom("no way out can be reached")
-    longest = min(_time(spot.ego, v), *(_time(spot.other, speed_of(x, v)) for x in intent.actors), 1e3)
+    runs = _runs_red(intent)
+    others = [SLOWEST if runs else speed_of(x, v) for x in intent.actors]
+    longest = min(_time(spot.ego, v), *(_time(spot.other, speed) for speed in others), 1e3)
     reason: Exception = _NoRoom("the roads before the junction are too short")
-    for time in (MEET, MEET + 2, MEET + 4, MEET - 2, MEET - 3):
+    for time in np.arange(MEET - 3, longest) if runs else MEETS:
         if time < longest:
             try:
-                return _meet(intent, spot, tuning, v, time)
+                return _meet(intent, spot, tuning, v, float(time))
             except _NoRoom as error:
                 reason = error
     raise reason
@@ -319,11 +336,25 @@ def _meet(intent: Intent, spot: Meeting, tuning: Tuning, v: float, time: float) 
             raise InstructionError(f"'{kind.replace('_', ' ')}' needs a stretch of road, not a junction")
         speed = speed_of(actor, v)
         more: dict[str, Any] = {"goal": theirs, "keeps_lane": True}
+        if kind == "run_red":
+            speed = min(speed, (_time(spot.other, 1.0) - back) / time)  # the road before may be short
+            if not _has_red(spot, time, v, speed, tuning):
+                raise _NoRoom("no moment at which the ego has green and the other one red")
         if actor.careless or kind == "run_red":
             more["action"] = [{"speed": round(speed, 2), "careful": False}]
         front = _before(spot.other, speed, time - tuning.earlier) - back
         back += _queue(placed, actor, spot.other.approach, front, 0, speed, more)
     return placed
+
+
+def _has_red(spot: Meeting, time: float, own: float, speed: float, tuning: Tuning) -> bool:
+    """Whether the ego comes to its stop line at green, and the other one to its own at red."""
+    network = spot.ego.approach.map.network
+    passes = time - spot.ego.crossing / own
+    other = time - tuning.earlier - spot.other.crossing / speed
+    green = [light_at(network, spot.ego.movement, t) or "" for t in (passes - GREEN, passes, passes + 1.0)]
+    red = [light_at(network, spot.other.movement, t) for t in (other - 0.5, other, other + 0.5)]
+    return set(green) <= set("gG") and red == ["r"] * 3
 
 
 def _time(way: Way, v: float) -> float:
