@@ -146,22 +146,23 @@ def text(result: dict[str, Any]) -> str:
 
 
 WORLDS = (
-    ("roundabout", "pdm_closed", "contact"),
-    ("highway", "pdm_closed", "fault"),
-    ("highway", "limsim_tm", "fault"),
+    ("long_route", "pdm_closed", "fault", 2_000, 2_000),
+    ("roundabout", "pdm_closed", "contact", 4_000, 10_000),
+    ("highway", "pdm_closed", "fault", 2_000, 5_000),
+    ("highway", "limsim_tm", "fault", 1_500, 3_000),
 )
-"""Scenario, policy and event of the rows of worlds."""
+"""Scenario, policy, event, and worlds for subset simulation and for counting; without `--full`, a tenth."""
 
 
 def worlds(full: bool) -> dict[str, Any]:
     """Probabilities in worlds, by subset simulation and by counting other worlds."""
     import limsim_jax as lj
 
-    sampled, counted = (20_000, 100_000) if full else (3_000, 3_000)
     found = []
-    for scenario, policy, event in WORLDS:
+    for scenario, policy, event, sampled, counted in WORLDS:
         methods: tuple[tuple[Any, int, int], ...] = (("subset", sampled, 0), ("crude", counted, 1))
         for method, budget, seed in methods:
+            budget = budget if full else budget // 10
             out = Path("results") / "rare_worlds" / f"{scenario}-{policy}-{event}-{method}-{budget}"
             one = lj.estimate(
                 scenario, event, policy=policy, method=method, worlds=budget, seed=seed, out=out
