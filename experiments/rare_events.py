@@ -146,7 +146,7 @@ def text(result: dict[str, Any]) -> str:
 
 
 WORLDS = (
-    ("long_route", "pdm_closed", "fault", 2_000, 2_000),
+    ("ramp", "end_to_end", "fault", 1_500, 2_000),
     ("roundabout", "pdm_closed", "contact", 4_000, 10_000),
     ("highway", "pdm_closed", "fault", 2_000, 5_000),
     ("highway", "limsim_tm", "fault", 1_500, 3_000),

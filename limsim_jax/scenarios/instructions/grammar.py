@@ -10,7 +10,7 @@ import re
 
 from limsim_jax.scenarios.instructions.draft import Draft
 from limsim_jax.scenarios.instructions.intent import InstructionError, Intent
-from limsim_jax.scenarios.instructions.phrases import PHRASES
+from limsim_jax.scenarios.instructions.phrases import ADJECTIVE, PHRASES
 
 LONGEST = 2000
 """Characters of an instruction."""
@@ -44,7 +44,8 @@ def parse(text: str) -> Intent:
                 place = found.end()
                 break
         else:
-            word = re.split(r"[\s,.;:!]", plain[place:])[0]
+            rest = re.sub(rf"^(?:{ADJECTIVE} )+(?=\w)", "", plain[place:])  # of a vehicle that is not known
+            word = re.split(r"[\s,.;:!]", rest)[0]
             raise InstructionError(f"does not know '{word}' in '{text.strip()}'")
     return draft.intent()
 
