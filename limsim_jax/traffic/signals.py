@@ -23,7 +23,7 @@ DETECTOR = 40.0
 """m before the stop line in which vehicles keep an actuated light green."""
 
 ON_LINE = 0.5
-"""m beyond a stop line where a front bumper has not crossed it yet."""
+"""m beyond a stop line, within its lane, where a front bumper has not crossed it yet."""
 
 
 @jax.named_scope("lights")
@@ -81,7 +81,7 @@ def crosses_on_red(lane_map: LaneMap, state: State, dx: Float[Array, " N"]) -> B
     lane = jnp.where(entered, state.previous, state.lane)
     onto = jnp.where(entered, state.lane, lane_map.routes.next_lane[state.lane, state.goal])
     front = state.s + jnp.where(entered, lane_map.length[lane], 0)
-    line = lane_map.stop_s[lane] + ON_LINE
+    line = jnp.minimum(lane_map.stop_s[lane] + ON_LINE, lane_map.length[lane])
     red = lane_states(lane_map.signals, state.lights.phase) == SignalState.RED
     crossed = state.active & (front - dx <= line) & (front > line) & (lane != NO_LANE)
     return crossed & (onto != NO_LANE) & red[onto]

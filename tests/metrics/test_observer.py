@@ -144,7 +144,7 @@ def test_crossing_a_stop_line_on_red():
             front = host().length[lane] + front
         else:
             onto = host().routes.next_lane[lane, state.goal[slot]]
-        line = host().stop_s[lane] + 0.5
+        line = min(host().stop_s[lane] + 0.5, host().length[lane])
         crossed = front - tick.dx[slot] <= line < front
         expected = crossed and onto != NO_LANE and shows(state)[onto] == SignalState.RED
         told.append((expected, crossed))

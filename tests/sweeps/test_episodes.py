@@ -138,7 +138,7 @@ def test_lights_crossed_on_red(policy, seed):
         if not trace.active[t, ego]:
             continue
         before, lane = trace.lane[t - 1, ego], trace.lane[t, ego]
-        line = float(lane_map.stop_s[before]) + 0.5
+        line = min(float(lane_map.stop_s[before]) + 0.5, float(lane_map.length[before]))
         entered = lane != before and trace.s[t, ego] < 5  # not a lane change
         front = trace.s[t, ego] + (float(lane_map.length[before]) if entered else 0)
         onto = lane if entered else lane_map.routes.next_lane[lane, egos.goal[0]]

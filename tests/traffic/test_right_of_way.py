@@ -13,12 +13,12 @@ from scipy.optimize import curve_fit
 from synthetic import arc, curve, intersection, network, straight
 from traffic_worlds import bundled, drivers, shapes, state_of
 
-from limsim_jax.maps.lane_map import LaneMap, lane_rows
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, lane_rows
 from limsim_jax.maps.network import Control
 from limsim_jax.maps.rasterise import build_lane_map
 from limsim_jax.maps.routing import default_goals
 from limsim_jax.maps.signal_table import SignalState
-from limsim_jax.maps.signals import phase_at
+from limsim_jax.maps.signals import lane_states, phase_at
 from limsim_jax.simulation.rollout import Rollout, world_key
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.command import Command
@@ -27,7 +27,7 @@ from limsim_jax.traffic.engine import Traffic, decide, drive
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.right_of_way import Approaches, passage, travel_time
 from limsim_jax.traffic.right_of_way.stops import stop_signs, stops_at_lights
-from limsim_jax.traffic.signals import DETECTOR, GAP, switch
+from limsim_jax.traffic.signals import DETECTOR, GAP, crosses_on_red, switch
 from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import default_population
 from limsim_jax.types import Config, Lights, Status
@@ -508,6 +508,33 @@ def test_running_a_red_light_is_told_where_the_line_stands_well_before_the_junct
     state = state_of("intersection", lanes, list(line + np.array([-2.0, 2.0, 0.3])), [13.0, 13.0, 0.0], goals)
     end, _ = runner(True, 10)(state)
     assert [(int(x) & int(Status.RED_LIGHT)) > 0 for x in np.asarray(end.status)[:3]] == [True, False, False]
+
+
+@pytest.mark.parametrize("setback", [0.0, 0.3, 0.8, 5.75])
+def test_a_red_light_is_run_once_wherever_its_line_stands(setback):
+    """The vehicle drives over the line and through the junction in steps of unequal length."""
+    _, lane_map = bundled("intersection")
+    lit = np.asarray(lane_map.signals.lane_program) >= 0
+    lane, goal = next(x for x in straight_on(lane_map) if lit[int(lane_map.routes.next_lane[x])])
+    onto, length = int(lane_map.routes.next_lane[lane, goal]), float(lane_map.length[lane])
+    lane_map = dataclasses.replace(lane_map, stop_s=lane_map.stop_s.at[lane].set(length - setback))
+    start = state_of("intersection", [lane], [0.0], [9.0], [goal])
+    steps = np.random.default_rng(3).uniform(0.05, 1.2, 60)
+    for phase in range(int(lane_map.signals.num_phases[0])):
+        lights = dataclasses.replace(start.lights, phase=start.lights.phase.at[0].set(phase))
+        red = int(lane_states(lane_map.signals, lights.phase)[onto]) == SignalState.RED
+        told = []
+        for x, dx in zip(length - 15 + np.cumsum(steps), steps, strict=True):
+            beyond = bool(x > length)
+            state = dataclasses.replace(
+                start, lights=lights, s=jnp.array([x - length if beyond else x], jnp.float32),
+                lane=jnp.array([onto if beyond else lane]),
+                previous=jnp.array([lane if beyond else NO_LANE]),
+            )  # fmt: skip
+            if crosses_on_red(lane_map, state, jnp.array([dx], jnp.float32))[0]:
+                told.append(x)
+        line = length - setback
+        assert len(told) == red and all(line < x <= min(line + 0.5, length) + 1.2 for x in told)
 
 
 def test_capacity_of_a_minor_stream_falls_with_the_major_flow_as_siegloch_has_it():
