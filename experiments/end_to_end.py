@@ -112,7 +112,7 @@ def row(experiment: ExperimentFile, name: str, driver: EndToEnd, seeds: int, out
     mine = (pc.field("scenario") == experiment.name) & (pc.field("policy") == label)
     columns = rows.filter(mine & (pc.field("seed") < seeds)).to_pydict()
     found: dict[str, Any] = {"scenario": experiment.name, "driver": name, "seeds": seeds}
-    for event in ("success", "at_fault_contacts", "off_road", "policy_failed"):
+    for event in ("success", "at_fault_contacts", "off_road", "red_lights", "policy_failed"):
         count = int(np.sum(np.asarray(columns[event], float) > 0))
         found[event] = [count / seeds, *wilson(count, seeds)[-2:]]
     for mean, column in (("completion", "completion"), ("score", "limsim_faithful_drive")):

@@ -85,10 +85,6 @@ WORK = (
     "A pallet lies in our lane 120 m ahead of the ego at 90 km/h",
     "A car is close behind the ego at 33 m/s on a quiet motorway",
     "A bus pulls out in front of the ego in the city",
-)
-"""Instructions that were known while the grammar was written."""
-
-APART = (
     "A delivery van pulls into our lane 12 m ahead of the ego on a motorway and then brakes hard",
     "On a dry three-lane motorway a lorry in front of the ego slows to 15 m/s",
     "The vehicle ahead makes an emergency stop in the city",
@@ -109,6 +105,30 @@ APART = (
     "The lead truck leaves its lane and a stopped car is 60 m ahead of it",
     "A tailgating van follows the ego at 25 m/s on a highway",
     "On an icy motorway the car in front slows down to 10 m/s, then speeds up to 20 m/s",
+)
+"""Instructions that were known while the grammar was written."""
+
+APART = (
+    "The car in front of us on the motorway brakes sharply to a standstill",
+    "A hatchback cuts in 18 m ahead of the ego at 30 m/s",
+    "Light rain in town: the minibus ahead brakes gently",
+    "A tanker drives 8 m/s slower than the ego on a three-lane highway",
+    "A car overtakes the ego and then brakes hard",
+    "A lost tyre lies 90 m ahead in the ego's lane on the motorway",
+    "At an intersection with traffic lights the ego goes straight on while an oncoming truck turns left",
+    "A police car jumps the red light from the right",
+    "An SUV merges from the slip road 15 m in front of the ego",
+    "A driver in the left lane swerves into our lane",
+    "The bus in front of the ego pulls out and a broken-down car stands 150 m ahead",
+    "On a snowy rural road, the vehicle ahead slows to 8 m/s",
+    "A pickup follows the ego too closely at 100 km/h",
+    "Dense traffic on a four-lane motorway; a van changes lanes to the left",
+    "A taxi enters the roundabout from the left",
+    "We drive at 60 km/h on a country road and a truck ahead stops",
+    "A motorcyclist cuts in from the right 10 m ahead of the ego",
+    "The ego turns right at a junction without lights; a bus comes from the left",
+    "An aggressive truck crosses our path from the right without yielding",
+    "A car is 40 m ahead, accelerates to 35 m/s and then brakes in an emergency",
 )
 """Instructions that were written apart."""
 

@@ -328,8 +328,8 @@ def end_to_end(result: dict[str, Any]) -> str:
     """Variants of the end-to-end driver by scenario, and its card."""
     rows = [
         "| scenario | driver | seeds | success, % | route completion, % | LimSim driving score "
-        "| contact at fault, % | off the road, % |",
-        "|---|---|---:|---|---:|---|---:|---:|",
+        "| contact at fault, % | off the road, % | red light run, % |",
+        "|---|---|---:|---|---:|---|---:|---:|---:|",
     ]
     order = {name: k for k, name in enumerate([*PAPER, *NETWORKS])}
     last = len(order)
@@ -341,7 +341,8 @@ def end_to_end(result: dict[str, Any]) -> str:
             f"| {where} | {r['driver']} | {r['seeds']} | {bounded(r['success'], 100)} "
             f"| {100 * r['completion'][0]:.1f} | {bounded(r['score'])}"
             f"{'' if theirs is None else f' ({theirs})'} "
-            f"| {100 * r['at_fault_contacts'][0]:.1f} | {100 * r['off_road'][0]:.1f} |"
+            f"| {100 * r['at_fault_contacts'][0]:.1f} | {100 * r['off_road'][0]:.1f} "
+            f"| {100 * r['red_lights'][0]:.1f} |"
         )
     about = result["about"]
     samples = ", ".join(f"{name} {count:,}" for name, count in about["samples"].items())

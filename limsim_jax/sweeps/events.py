@@ -28,8 +28,9 @@ FARTHEST = 1e3
 _TOUCHED = 1e-3
 """m/s, added to the impact of a contact, which may be 0."""
 
-_BLAMELESS = 0.05
-"""s, least limit state of a contact that is not at fault."""
+_BLAMELESS = 1.0
+"""s, least limit state of a contact that is not at fault. Such worlds lead nowhere: those nearer to a contact
+of their own must come before them."""
 
 _CONDITION = re.compile(r"\s*([A-Za-z_][A-Za-z0-9_]*)\s*(<=|>=|<|>)\s*(\S+)\s*")
 

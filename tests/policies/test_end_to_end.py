@@ -300,7 +300,10 @@ def test_the_filter_lowers_speeds_holds_at_red_and_lets_go_in_the_end():
     target, held = filtered(zero, jnp.full(1, 2.0), clear, red, jnp.full(1, UNBLOCK), 0.5)
     assert (float(target[0]), float(held[0])) == (0, 0)  # at a red light it waits as long as it takes
     target, _ = filtered(jnp.full(1, 9.0), jnp.full(1, 9.5), clear, red, zero, 0.5)
-    assert float(target[0]) == 9.5
+    assert float(target[0]) == 0  # and it brakes for one
+    for doubt in ([3.0, 0.5, 0.0], [-0.5, 3.0, 0.0]):  # perhaps red, perhaps not at a junction
+        target, _ = filtered(jnp.full(1, 9.0), jnp.full(1, 9.5), clear, jnp.array([doubt]), zero, 0.5)
+        assert float(target[0]) == 9.5
 
 
 # --- weights and bad input

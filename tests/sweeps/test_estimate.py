@@ -238,18 +238,21 @@ def test_the_limit_state_leads_to_a_contact():
         columns(min_distance=2.0),
         columns(min_ttc=6.0),
         columns(min_ttc=1.0),
+        columns(min_ttc=0.0, min_distance=1.0),  # side by side
+        columns(min_ttc=0.0, min_distance=0.3),
         columns(contacts=1.0, min_ttc=0.0, max_delta_v=0.0),
         columns(contacts=1.0, min_ttc=0.0, max_delta_v=9.0),
     ]
     g = np.concatenate([limit(world) for world in worlds])
-    assert (np.diff(g) < 0).all() and (g[:5] > 0).all() and (g[5:] < 0).all()
+    assert (np.diff(g) < 0).all() and (g[:7] > 0).all() and (g[7:] < 0).all()
 
 
-def test_a_contact_without_fault_is_near_a_contact_at_fault():
+def test_a_contact_without_fault_leads_less_far_than_a_near_one():
     limit = event_of("fault", UNITS).limit
     hit = columns(contacts=1.0, min_ttc=0.0, max_delta_v=9.0)
     guilty = columns(contacts=1.0, at_fault_contacts=1.0, min_ttc=0.0, max_delta_v=9.0)
-    assert 0 < limit(hit)[0] < limit(columns(min_ttc=1.0))[0]
+    near = columns(min_ttc=0.2, min_distance=1.0)
+    assert limit(near)[0] < limit(hit)[0] < limit(columns(min_ttc=1.0))[0]
     assert limit(guilty)[0] < 0
 
 

@@ -27,7 +27,7 @@ def verbs(*words: str) -> str:
     forms = []
     for word in words:
         doubled = word + word[-1] if word in ("cut", "stop", "run") else word.removesuffix("e")
-        ending = "es" if word.endswith(("ss", "sh", "o")) else "s"
+        ending = "es" if word.endswith(("ss", "sh", "ch", "x", "o")) else "s"
         forms += [f"{word}{ending}", f"{doubled}ing", word]
     return f"(?:{'|'.join(forms)})"
 
@@ -50,15 +50,19 @@ OURS = rf"(?:{OWN}|the ego's|our|my)"
 OWN = f"(?:{OWN})"
 HOW = r"(?:hard|sharply|heavily|strongly|suddenly|abruptly|gently|slightly|softly|fully|firmly)"
 NOUNS = {
-    "truck": r"trucks?|lorry|lorries|semis?|trailers?|hgvs?",
-    "van": r"vans?",
-    "bus": r"bus(?:es)?|coach(?:es)?",
+    "truck": r"(?:articulated )?(?:trucks?|lorry|lorries)|semis?|(?:semi-)?trailers?|tankers?|hgvs?|"
+    r"heavy goods vehicles?",
+    "van": r"(?:delivery |transit |camper )?vans?|minibus(?:es)?",
+    "bus": r"(?:city |school |double-decker )?bus(?:es)?|coach(?:es)?",
     "motorcycle": r"motor(?:cycle|bike)s?|motorcyclists?",
-    "emergency": r"ambulance|police car|fire engine|fire truck",
-    "obstacle": r"obstacles?|debris|box|barrier|cones?|pallet|object",
-    "car": r"cars?|vehicles?|sedan|taxi|suv|driver",
+    "emergency": r"ambulances?|police (?:cars?|vehicles?|vans?)|fire (?:engines?|trucks?)|"
+    r"emergency vehicles?",
+    "obstacle": r"obstacles?|debris|box(?:es)?|barriers?|cones?|pallets?|objects?|tyres?|tires?|rocks?|"
+    r"boulders?|trees?|branch(?:es)?|lost cargo",
+    "car": r"(?:passenger |estate |sports )?cars?|vehicles?|sedans?|saloons?|hatchbacks?|minivans?|"
+    r"pickups?(?: trucks?)?|jeeps?|limousines?|cabs?|taxis?|suvs?|motorists?|drivers?",
 }
-NOUN = f"(?:{'|'.join(NOUNS.values())})"
+NOUN = f"(?:{'|'.join(NOUNS[kind] for kind in ('emergency', *NOUNS))})"
 ADJECTIVES: dict[str, dict[str, Any]] = {
     r"slow|slower|slow[- ]moving": {"acts": ({"kind": "slow"},)},
     r"fast|faster|speeding|fast[- ]moving": {"faster": (BRISK, BRISK)},
@@ -66,6 +70,9 @@ ADJECTIVES: dict[str, dict[str, Any]] = {
     r"oncoming": {"place": "oncoming"},
     r"crossing": {"acts": ({"kind": "cross"},)},
     r"merging": {"acts": ({"kind": "merge"},)},
+    r"braking": {"acts": ({"kind": "brake"},)},
+    r"overtaking": {"acts": ({"kind": "overtake"},)},
+    r"tailgating": {"acts": ({"kind": "tailgate"},), "place": "behind"},
     r"aggressive|reckless": {"careless": True},
 }
 ADJECTIVE = f"(?:{'|'.join(ADJECTIVES)})"
@@ -115,7 +122,7 @@ def no_effect(draft: Draft, found: Match[str]) -> None:
 
 def vehicle(draft: Draft, found: Match[str]) -> None:
     """A vehicle with its article and adjectives."""
-    for adjective in (found["adjs"] or "").split():
+    for adjective in re.findall(ADJECTIVE, found["adjs"] or ""):
         draft.waiting |= next(x for words, x in ADJECTIVES.items() if re.fullmatch(words, adjective))
     kind = next(kind for kind, words in NOUNS.items() if re.fullmatch(words, found["noun"]))
     article = (found["article"] or "").strip()
@@ -303,14 +310,14 @@ _VEHICLES: tuple[tuple[str, Effect], ...] = (
      r"(?:'s path| path| way)?", ahead),
     (r"behind(?= (?:an?|the(?! ego)|another|\d) )", behind),
     (rf"(?:from behind|behind) ?{OWN}?", field_of("place", "behind")),
-    (rf"from the opposite direction|(?:coming )?towards? {OWN}", field_of("place", "oncoming")),
+    (rf"from the opposite direction|(?:coming )?towards? (?:{OWN}|it|them)", field_of("place", "oncoming")),
     (rf"(?:beside|next to|alongside|level with) {OWN}", field_of("place", "beside")),
     (rf"(?:to|on|at) the (?P<side>left|right)(?: of {OWN})?(?! lane)(?P<from>)?", lane),
 )  # fmt: skip
 
 _LANE_CHANGES: tuple[tuple[str, Effect], ...] = (
     (rf"(?:{verbs('cut')} ?in|{verbs('pull')} (?:in|out)(?= in front| ahead| before)|"
-     rf"{verbs('swerve', 'move', 'change', 'merge')} (?:over )?(?:in)?to {OURS} lane|"
+     rf"{verbs('swerve', 'move', 'change', 'merge', 'pull')} (?:over )?(?:in)?to {OURS} lane|"
      rf"{verbs('cut')} (?:us|the ego)(?: off)?|{verbs('cut')} off (?:us|the ego))", act("cut_in")),
     (rf"(?:{verbs('cut')} ?out|{verbs('pull')} out(?: of (?:the|its|{OURS}) (?:lane|way))?|"
      rf"{verbs('swerve')} (?:out|away)|{verbs('leave')} (?:the|its|{OURS}) lane)", act("cut_out")),

@@ -35,8 +35,8 @@ from limsim_jax.scenarios.instructions.plans import (
     speed_of,
 )
 
-HORIZON, AT_LIGHTS = 25.0, 60.0
-"""s of an episode; where traffic lights may have to change first."""
+HORIZON, LONGER = 25.0, 60.0
+"""s of an episode; where traffic lights may have to change first, and where nobody brakes fast."""
 
 MEET = 7.0
 """s after the start at which two vehicles meet at a junction or a ramp."""
@@ -260,7 +260,18 @@ def _at_merge(intent: Intent, spot: Merge, tuning: Tuning) -> Placed:
     """Vehicles from the ramp and on the motorway reach its end together."""
     v = own_speed(intent, min(spot.main.limit, SPEEDS["motorway"] * 1.2))
     slower = min(v, spot.ramp.limit) * ON_RAMP
-    time = min(MEET, spot.main_at / v - 1.5, spot.ramp_at / slower - 1.5)
+    longest = min(MEET, spot.main_at / v - 1.5, spot.ramp_at / slower - 1.5)
+    reason: Exception = _NoRoom("the roads before the ramp are too short")
+    for time in np.arange(longest, min(longest, MEET - 4) - 0.1, -1.0):
+        try:
+            return _merge_after(intent, spot, tuning, v, slower, float(time))
+        except _NoRoom as error:
+            reason = error
+    raise reason
+
+
+def _merge_after(intent: Intent, spot: Merge, tuning: Tuning, v: float, slower: float, time: float) -> Placed:
+    """They reach it after `time` s."""
     goal = _goal(spot.main)
     line, at, own = (spot.ramp, spot.ramp_at, slower) if intent.merges else (spot.main, spot.main_at, v)
     x = at - own * time

@@ -20,6 +20,9 @@ FOLLOWS, CLOSE = 1.5, 0.5
 CHANGE = 3.0
 """s that a lane change takes."""
 
+QUICKEST = 1.5
+"""s that a lane change takes at least: of a vehicle that is much faster than the ego, and stays near."""
+
 SLOWER = 3.0
 """m/s by which a vehicle that cuts in is slower than the ego."""
 
@@ -168,8 +171,9 @@ def _cut_in(case: _Case) -> Plan:
     if "overtake" in case.kinds:
         front, passes = case.behind(OVERTAKES), max(faster, 1.0)
         middle_at = (near + case.length - front) / passes
+        move["duration"] = round(min(max(2 * (near - BESIDE) / passes, QUICKEST), CHANGE), 2)
         past = (BESIDE + case.length - front) / passes
-        move["at"] = round(max(middle_at - CHANGE / 2, past), 2)
+        move["at"] = round(max(middle_at - move["duration"] / 2, past), 2)
     elif faster < -0.5:
         front = max(near - faster * case.time if case.gap is None else case.gap, near + 1) + case.length
         move["within"] = round(near + (case.length + EGO) / 2, 2)

@@ -15,17 +15,17 @@ from limsim_jax.maps import bundled_maps
 from limsim_jax.maps.map import Map, load_map
 from limsim_jax.scenarios.instructions.events import happened
 from limsim_jax.scenarios.instructions.grammar import parse
-from limsim_jax.scenarios.instructions.intent import InstructionError, Intent, RoadKind
+from limsim_jax.scenarios.instructions.intent import Act, InstructionError, Intent, RoadKind
 from limsim_jax.scenarios.instructions.place import (
-    AT_LIGHTS,
     DENSITY,
     HORIZON,
+    LONGER,
     NO_TUNING,
     NoPlace,
     Placed,
     place,
 )
-from limsim_jax.scenarios.instructions.plans import Tuning
+from limsim_jax.scenarios.instructions.plans import STEADY, Tuning
 from limsim_jax.scenarios.instructions.straight import write_straight
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import ExperimentError, ExperimentFile
@@ -36,6 +36,12 @@ SEEDS = 10
 SHOWN, AVOIDED = 0.8, 0.8
 """Least share of them in which everything happens that was asked for, and in which the reference driver has
 no contact."""
+
+SLIPPERY = 0.2
+"""Friction below which an episode lasts `LONGER`."""
+
+GRIP = 0.9
+"""Share of the grip of a road with which vehicles brake on it at most."""
 
 REFERENCE = "like_traffic"
 """Policy that drives the ego while a scenario is tried."""
@@ -161,6 +167,7 @@ def scenario(
     """
     intent = understand(text) if isinstance(text, str) else text
     said = text if isinstance(text, str) else intent.model_dump_json(exclude_defaults=True)
+    intent = _within_grip(intent)
     maps = _maps(intent, map, Path(folder))
     worst: list[str] = []
     for number, tuning in enumerate(TRIES):
@@ -183,6 +190,20 @@ def scenario(
             return Scenario(said, intent, file, found, number + 1, tuning)
         worst.append(_why(intent, found))
     raise InstructionError(f"it does not come out, after {len(TRIES)} placements: {worst[0]}")
+
+
+def _within_grip(intent: Intent) -> Intent:
+    """The same; nobody brakes harder than the road allows."""
+    if intent.friction is None:
+        return intent
+    most = round(GRIP * intent.friction * 9.81, 2)
+
+    def slower(act: Act) -> Act:
+        rate = min(STEADY if act.rate is None else act.rate, most)
+        return act.model_copy(update={"rate": rate}) if act.kind == "brake" else act
+
+    actors = [x.model_copy(update={"acts": type(x.acts)(map(slower, x.acts))}) for x in intent.actors]
+    return intent.model_copy(update={"actors": type(intent.actors)(actors)})
 
 
 def severity(made: Scenario, seeds: int = SEEDS) -> list[tuple[float, Scenario]]:
@@ -287,12 +308,13 @@ def _file(text: str, intent: Intent, placed: Placed) -> ExperimentFile:
         zones.append({"speed_limit": round(limit, 2)})
     if intent.friction is not None:
         zones.append({"friction": intent.friction})
+    grip = 1.0 if intent.friction is None else intent.friction
     density = DENSITY[intent.traffic or "none"]
     named = len(placed.vehicles) + len(placed.obstacles)
     return ExperimentFile.model_validate(
         {
             "name": slug(text), "map": _name_of(placed.map), "description": text.strip(),
-            "horizon": AT_LIGHTS if placed.signalled else HORIZON,
+            "horizon": LONGER if placed.signalled or grip < SLIPPERY else HORIZON,
             "slots": _slots(placed.map, density, named),
             "traffic": {"density": density}, "zone": zones,
             "ego": placed.ego | {"policy": REFERENCE, "driver": KEEPS_LANE},
