@@ -231,7 +231,9 @@ def load_program(name: str | None) -> Any:
         return None
     path = _program_path(name)
     try:
-        found = serialize_executable.deserialize_and_load(*pickle.loads(path.read_bytes()))
+        devices, *program = pickle.loads(path.read_bytes())
+        on = jax.local_devices()[:devices]  # without a word, of all devices
+        found = serialize_executable.deserialize_and_load(*program, execution_devices=on)
         os.utime(path)
         return found
     except Exception:  # not there, damaged, or of another machine
@@ -267,12 +269,15 @@ def keep_program(name: str | None, program: Any) -> Any:
     path = _program_path(name)
     with contextlib.suppress(Exception):  # a program that cannot be kept, or a full disk
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, pickle.dumps(serialize_executable.serialize(program)))
+        shardings = jax.tree.leaves((program.input_shardings, program.output_shardings))
+        devices = max((len(x.device_set) for x in shardings), default=1)
+        write_whole(path, pickle.dumps((devices, *serialize_executable.serialize(program))))
         _forget(path.parent)
     return program
 
 
 def _program_path(name: str) -> Path:
+    enable_compilation_cache()
     config, device = jax.config.values, jax.local_devices()[0]
     settings = [
         jax.__version__, jaxlib.version.__version__, device.platform, device.device_kind,
@@ -281,7 +286,6 @@ def _program_path(name: str) -> Path:
         config["jax_default_matmul_precision"],
     ]  # fmt: skip
     key = hashlib.sha256(repr((name, settings)).encode()).hexdigest()[:32]
-    enable_compilation_cache()
     return Path(config["jax_compilation_cache_dir"]) / "limsim_jax" / f"{key}.bin"
 
 

@@ -244,3 +244,26 @@ def test_all_devices_may_wait_for_the_host_at_once():
     """Large arguments of a function on the host arrive although every device waits."""
     plain = {name: x for name, x in os.environ.items() if name not in ("NPROC", "XLA_FLAGS")}
     subprocess.run([sys.executable, "-c", ASKS], env=plain, check=True, timeout=120)
+
+
+KEEPS = """
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from limsim_jax.xla import keep_program, load_program, use_all_cores
+
+assert use_all_cores(2) == 2
+spread = NamedSharding(Mesh(np.array(jax.local_devices()), ("worlds",)), PartitionSpec("worlds"))
+for name, where in {"one": jax.local_devices()[0], "two": spread}.items():
+    x = jax.device_put(jnp.arange(4.0), where)
+    keep_program(name, jax.jit(lambda x: 2 * x).lower(x).compile())
+    np.testing.assert_array_equal(load_program(name)(x), [0, 2, 4, 6])
+"""
+
+
+def test_programs_of_one_device_and_of_several_are_kept_side_by_side(tmp_path):
+    clean = {name: x for name, x in os.environ.items() if name not in ("NPROC", "XLA_FLAGS")}
+    clean["LIMSIM_JAX_CACHE"] = str(tmp_path)
+    subprocess.run([sys.executable, "-c", KEEPS], env=clean, check=True, timeout=120)
