@@ -12,6 +12,8 @@ import limsim_jax as lj
 from limsim_jax.bridges.chat.faults import Scripted
 from limsim_jax.cli.main import main
 from limsim_jax.maps.network import Turn
+from limsim_jax.maps.signal_table import SignalState
+from limsim_jax.maps.signals import lane_states, phase_at
 from limsim_jax.policies.language.chat import Server
 from limsim_jax.scenarios.instructions import scenario as making
 from limsim_jax.scenarios.instructions.corridor import corridors, meetings, merges
@@ -46,6 +48,10 @@ UNDERSTOOD = {
     "A motorcycle overtakes the ego and cuts in 10 m ahead": {
         "actors": [{"kind": "motorcycle", "place": "behind", "faster": 8,
                     "acts": [{"kind": "overtake"}, {"kind": "cut_in", "gap": 10}]}],
+    },
+    "A broken down car blocks the lane and a tailgating van approaches from behind": {
+        "actors": [{"place": "ahead", "acts": [{"kind": "stand"}]},
+                   {"kind": "van", "place": "behind", "acts": [{"kind": "tailgate"}]}],
     },
     "The car ahead cuts out and reveals a stopped truck": {
         "actors": [{"place": "ahead", "lane": "same", "acts": [{"kind": "cut_out"}]},
@@ -91,6 +97,7 @@ def test_a_sentence_is_an_intent(text):
     ("text", "reason"),
     [
         ("a dragon flies by", "does not know 'dragon'"),
+        ("a slow fast dragon flies by", "does not know 'dragon'"),
         ("a pedestrian crosses the road", "'a pedestrian': there are motor vehicles only"),
         ("a car drives through a tunnel", "does not know 'through'"),
         ("a car", "nothing happens"),
@@ -183,6 +190,45 @@ def test_vehicles_reach_a_crossing_at_the_same_time():
                 break
             left -= lane.length
     assert np.linalg.norm(where[0] - where[1]) < 1.5
+
+
+def test_who_runs_a_red_light_passes_its_line_at_red_and_the_ego_its_own_at_green():
+    for side in ("left", "right"):
+        town = lj.load_map("intersection")
+        placed = place(
+            parse(f"A van runs a red light from the {side} while the ego goes straight on"), [town]
+        )
+        spot = next(
+            x for x in meetings(town, 60.0)
+            if placed.ego["start"] in x.ego.approach.lanes
+            and placed.vehicles[0]["start"] in x.other.approach.lanes
+            and x.comes_from == side
+            and x.ego.movement.turn is x.other.movement.turn is Turn.STRAIGHT
+        )  # fmt: skip
+        shown = []
+        for way, start in (spot.ego, placed.ego), (spot.other, placed.vehicles[0]):
+            x = way.approach.begins[way.approach.lanes.index(start["start"])] + start["s"]
+            row = list(town.lane_ids).index(way.movement.via[0])
+            phase = phase_at(town.lanes.signals, (way.approach.length - x) / start["v"])
+            shown.append(int(lane_states(town.lanes.signals, phase)[row]))
+        assert shown == [SignalState.GREEN_MAJOR, SignalState.RED]
+
+
+def test_nobody_brakes_harder_than_ice_allows(tmp_path):
+    made = lj.scenario("On an icy motorway the car ahead brakes hard to 10 m/s", folder=tmp_path, seeds=0)
+    (brake,) = (x for x in made.experiment.vehicle[0].action if x.brake is not None)
+    assert 0.8 < brake.brake < 0.1 * 9.81 and made.experiment.horizon > 30
+    dry = lj.scenario("On a motorway the car ahead brakes hard to 10 m/s", seeds=0).experiment
+    assert [x.brake for x in dry.vehicle[0].action if x.brake] == [6.0]
+
+
+def test_what_overtakes_fast_changes_lanes_fast():
+    cut = {}
+    for v in (33, 45):
+        intent = parse(f"A motorcycle overtakes the ego at {v} m/s and cuts in 10 m ahead")
+        move = plan(intent.actors[0], 25.0, Tuning(), intent).actions[1]
+        cut[v] = move["duration"], move["at"]
+    assert cut[33][0] > cut[45][0] == 1.5 and cut[33][1] > cut[45][1]
 
 
 def test_ramps_and_roundabouts_are_found():

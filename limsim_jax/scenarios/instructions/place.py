@@ -47,6 +47,9 @@ MEETS = (MEET, MEET + 2, MEET + 4, MEET - 2, MEET - 3)
 SLOWEST = 5.0
 """m/s of a vehicle on its way to a red light, at least."""
 
+PATIENT = (1.0, 0.8, 0.65)
+"""Factors on the speed of the ego, of which it takes the first that gets it to its light in time."""
+
 GREEN = 3.0
 """s for which the ego has had a green light when a vehicle runs the red one: it need not brake for it."""
 
@@ -323,14 +326,15 @@ def _at_junction(intent: Intent, spot: Meeting, tuning: Tuning) -> Placed:
         raise _NoRoom("no way out can be reached")
     runs = _runs_red(intent)
     others = [SLOWEST if runs else speed_of(x, v) for x in intent.actors]
-    longest = min(_time(spot.ego, v), *(_time(spot.other, speed) for speed in others), 1e3)
     reason: Exception = _NoRoom("the roads before the junction are too short")
-    for time in np.arange(MEET - 3, longest) if runs else MEETS:
-        if time < longest:
-            try:
-                return _meet(intent, spot, tuning, v, float(time))
-            except _NoRoom as error:
-                reason = error
+    for own in [v * x for x in PATIENT] if runs and intent.speed is None else [v]:
+        longest = min(_time(spot.ego, own), *(_time(spot.other, speed) for speed in others), 1e3)
+        for time in np.arange(MEET - 3, longest) if runs else MEETS:
+            if time < longest:
+                try:
+                    return _meet(intent, spot, tuning, own, float(time))
+                except _NoRoom as error:
+                    reason = error
     raise reason
 
 
@@ -348,7 +352,8 @@ def _meet(intent: Intent, spot: Meeting, tuning: Tuning, v: float, time: float) 
         speed = speed_of(actor, v)
         more: dict[str, Any] = {"goal": theirs, "keeps_lane": True}
         if kind == "run_red":
-            speed = min(speed, (_time(spot.other, 1.0) - back) / time)  # the road before may be short
+            if actor.speed is None and actor.faster is None:  # the road before may be short
+                speed = min(speed, (_time(spot.other, 1.0) - back) / time)
             if not _has_red(spot, time, v, speed, tuning):
                 raise _NoRoom("no moment at which the ego has green and the other one red")
         if actor.careless or kind == "run_red":
