@@ -148,8 +148,8 @@ def text(result: dict[str, Any]) -> str:
 WORLDS = (
     ("ramp", "end_to_end", "fault", 1_500, 2_000),
     ("roundabout", "pdm_closed", "contact", 4_000, 10_000),
-    ("highway", "pdm_closed", "fault", 1_500, 3_000),
-    ("highway", "limsim_tm", "fault", 1_000, 1_500),
+    ("highway", "pdm_closed", "fault", 1_500, 1_500),
+    ("highway", "limsim_tm", "fault", 500, 700),
 )
 """Scenario, policy, event, and worlds for subset simulation and for counting; without `--full`, a tenth."""
 
