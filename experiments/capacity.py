@@ -48,6 +48,7 @@ DT, WARM = 0.1, 300.0  # s
 SLOTS = 384
 STANDS = 1.5  # m/s
 FAST, RAMP, TOWN = 33.33, 22.22, 13.89  # m/s
+TWO_LANES = "about 3,600", "1,800 per lane"
 LONG = 3.0  # km of motorway on which lane changes are counted
 RING = 16.0  # m, radius of the roundabout
 
@@ -448,10 +449,10 @@ def cells() -> list[Cell]:
         )
     for rate in (3800.0, 4200.0):
         found.append(Cell("lane drop", f"3 to 2 lanes, {rate:,.0f} veh/h: served", "veh/h", lane_drop,
-                          {through: rate}, lambda s: flow(s, "out"), "3,600 and more"))  # fmt: skip
+                          {through: rate}, lambda s: flow(s, "out"), *TWO_LANES))  # fmt: skip
     demand = {through: 2400.0, ("ramp", "out"): 800.0, ("in", "exit"): 800.0}
     found.append(Cell("weaving", "2,400 through, 800 on, 800 off: served", "veh/h", weaving, demand,
-                      lambda s: flow(s, "out") + flow(s, "exit"), "3,600 and more"))  # fmt: skip
+                      lambda s: flow(s, "out") + flow(s, "exit"), *TWO_LANES))  # fmt: skip
     found.append(Cell("signal", "saturation flow from the fifth on", "veh/h", signal,
                       {through: 1800.0, ("side", "away"): 60.0}, lambda s: saturation(s, "out"),
                       "1,800 to 1,950", "HCM 6, chapter 19"))  # fmt: skip
