@@ -140,7 +140,7 @@ def lane_drop() -> Site:
 
 
 def weaving(length: float = 300.0) -> Site:
-    """A ramp on and a ramp off on one auxiliary lane beside two."""
+    """An on-ramp and an off-ramp share an auxiliary lane."""
     edge = -2 * 3.2
     nodes = {"west": (-1500.0, 0.0), "a": (0.0, 0.0), "b": (length, 0.0), "east": (length + 800, 0.0)}
     nodes |= {"far": (-300.0, edge - 30), "away": (length + 300.0, edge - 30)}
@@ -219,7 +219,10 @@ class Seen:
 
 
 def times(seen: Seen, road: str, start: str | None = None) -> list[NDArray[np.float64]]:
-    """s at which vehicles came onto a road, from one other or from all, for each world."""
+    """s at which vehicles came onto a road, by world.
+
+    From one other road, or from all.
+    """
     ways = [x for (a, b), x in seen.passes.items() if b == road and start in (None, a)]
     return [np.sort(np.concatenate(x)) for x in zip(*ways, strict=True)]
 
@@ -239,7 +242,7 @@ def best_five(seen: Seen, road: str) -> float:
 
 
 def saturation(seen: Seen, road: str) -> float:
-    """veh/h from the fifth to the last full headway of each green of 60 s."""
+    """veh/h from the fifth vehicle of each green on."""
     gaps: list[float] = []
     for t in times(seen, road):
         for start in np.arange(WARM, t[-1], 60.0):
@@ -418,7 +421,7 @@ class Cell:
 
 
 def _hcm(v: float, gap: float, follow: float) -> float:
-    """veh/h of a minor stream across `v` veh/h (HCM 6th edition, equation 20-36)."""
+    """veh/h of a minor stream across `v` veh/h (HCM 6, equation 20-36)."""
     return 3600 / follow if v == 0 else v * math.exp(-v * gap / 3600) / (1 - math.exp(-v * follow / 3600))
 
 

@@ -149,7 +149,7 @@ WORLDS = (
     ("ramp", "end_to_end", "fault", 1_500, 2_000),
     ("roundabout", "pdm_closed", "contact", 4_000, 10_000),
     ("highway", "pdm_closed", "fault", 1_500, 1_500),
-    ("highway", "limsim_tm", "fault", 1_100, 700),
+    ("highway", "limsim_tm", "fault", 1_100, 400),
 )
 """Scenario, policy, event, and worlds for subset simulation and for counting; without `--full`, a tenth."""
 
@@ -158,8 +158,11 @@ LEAST = 1_100
 """Worlds that subset simulation needs down to 1e-4."""
 
 
-def worlds(full: bool) -> dict[str, Any]:
-    """Probabilities in worlds, by subset simulation and by counting other worlds."""
+def worlds(full: bool) -> None:
+    """Write probabilities in worlds, as they are done.
+
+    By subset simulation, and by counting other worlds.
+    """
     import limsim_jax as lj
 
     found = []
@@ -172,8 +175,11 @@ def worlds(full: bool) -> dict[str, Any]:
                 scenario, event, policy=policy, method=method, worlds=budget, seed=seed, out=out
             )  # fmt: skip
             found.append(one.as_json())
-            print(one, flush=True)
-    return {"rows": found}
+            write("rare_worlds", {"rows": found}, worlds_text({"rows": found}))
+
+
+def _round(x: float) -> str:
+    return f"{x:,.0f}" if x >= 100 else f"{x:.2g}"
 
 
 def worlds_text(result: dict[str, Any]) -> str:
@@ -190,8 +196,8 @@ def worlds_text(result: dict[str, Any]) -> str:
         cells = []
         for name in ("per_episode", "per_hour", "per_million_km"):
             x = row[name]
-            said = f"{x['estimate']:.2g} [{x['low']:.2g}, {x['high']:.2g}]"
-            cells.append(said if x["estimate"] else f"below {x['high']:.2g}")
+            best, low, high = (_round(x[k]) for k in ("estimate", "low", "high"))
+            cells.append(f"{best} [{low}, {high}]" if x["estimate"] else f"below {high}")
         lines.append(
             f"| {row['scenario']} | {row['policy']} | {row['event']} | {row['method']} | {row['worlds']:,} "
             f"| {' | '.join(cells)} |"
@@ -217,8 +223,7 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="as many worlds as the published table")
     options = parser.parse_args()
     if options.worlds:
-        result = worlds(options.full)
-        return write("rare_worlds", result, worlds_text(result))
+        return worlds(options.full)
     quick = options.quick
     repeats, intervals = (10, 20) if quick else (REPEATS, COVERAGE)
     result = {

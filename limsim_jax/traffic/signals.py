@@ -67,8 +67,9 @@ def switch(
 
 
 def crosses_on_red(lane_map: LaneMap, state: State, dx: Float[Array, " N"]) -> Bool[Array, " N"]:
-    """Vehicles whose front has come over a stop line at red in the last `dx` m.
+    """Vehicles that have run a red light in the last `dx` m.
 
+    Their front has come over the stop line.
     The line may stand well before the end of its lane: what counts is the light when the front passes the
     line, not when the vehicle enters the junction.
 

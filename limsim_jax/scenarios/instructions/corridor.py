@@ -229,7 +229,9 @@ def signalled(meeting: Meeting) -> bool:
 
 
 def light_at(network: Network, movement: Movement, time: float) -> str | None:
-    """The letter of SUMO that a movement is shown `time` s after the start; None: it has no light.
+    """What the light of a movement shows `time` s after the start.
+
+    A letter of SUMO; None: it has no light.
 
     Actuated lights are taken to run their nominal durations, as they do until vehicles change them.
     """

@@ -36,7 +36,7 @@ from limsim_jax.scenarios.instructions.plans import (
 )
 
 HORIZON, LONGER = 25.0, 60.0
-"""s of an episode; where traffic lights may have to change first, and where nobody brakes fast."""
+"""s of an episode; where traffic lights may have to change first, and where the road is slippery."""
 
 MEET = 7.0
 """s after the start at which two vehicles meet at a junction or a ramp."""
@@ -364,7 +364,7 @@ def _meet(intent: Intent, spot: Meeting, tuning: Tuning, v: float, time: float) 
 
 
 def _has_red(spot: Meeting, time: float, own: float, speed: float, tuning: Tuning) -> bool:
-    """Whether the ego comes to its stop line at green, and the other one to its own at red."""
+    """Whether the ego comes at green, and the other one at red."""
     network = spot.ego.approach.map.network
     passes = time - spot.ego.crossing / own
     other = time - tuning.earlier - spot.other.crossing / speed

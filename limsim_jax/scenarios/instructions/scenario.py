@@ -193,7 +193,7 @@ def scenario(
 
 
 def _within_grip(intent: Intent) -> Intent:
-    """The same; nobody brakes harder than the road allows."""
+    """The same; no vehicle brakes harder than the road allows."""
     if intent.friction is None:
         return intent
     most = round(GRIP * intent.friction * 9.81, 2)
