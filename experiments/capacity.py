@@ -19,7 +19,7 @@ import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,7 @@ FAST, RAMP, TOWN = 33.33, 22.22, 13.89  # m/s
 TWO_LANES = "about 3,600", "1,800 per lane"
 LONG = 3.0  # km of motorway on which lane changes are counted
 RING = 16.0  # m, radius of the roundabout
+WIDTH = 3.2  # m, netconvert's lanes
 
 # --- sites -------------------------------------------------------------------------------------------
 
@@ -64,7 +65,7 @@ class Road:
     lanes: int
     speed: float  # m/s
     shape: Sequence[tuple[float, float]] = ()
-    priority: int = 1
+    priority: int = -1  # netconvert's
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def motorway() -> Site:
 
 def merge(lanes: int, length: float = 200.0) -> Site:
     """A ramp onto a motorway, with an acceleration lane without a taper."""
-    edge = -(lanes + 0.0) * 3.2
+    edge = -lanes * WIDTH
     nodes = {"west": (-1500.0, 0.0), "a": (0.0, 0.0), "b": (length, 0.0), "east": (length + 800, 0.0)}
     nodes["far"] = (-300.0, edge - 30)
     roads = {
@@ -141,7 +142,7 @@ def lane_drop() -> Site:
 
 def weaving(length: float = 300.0) -> Site:
     """An on-ramp and an off-ramp share an auxiliary lane."""
-    edge = -2 * 3.2
+    edge = -2 * WIDTH
     nodes = {"west": (-1500.0, 0.0), "a": (0.0, 0.0), "b": (length, 0.0), "east": (length + 800, 0.0)}
     nodes |= {"far": (-300.0, edge - 30), "away": (length + 300.0, edge - 30)}
     on = (-300, edge - 30), (-100, edge), (0, edge)
@@ -200,6 +201,9 @@ def crossing(kind: str) -> Site:
         roads |= {f"out_{name}": Road("a", name, 1, TOWN, priority=rank)}
     return Site(at | {"a": (0.0, 0.0)}, roads, kinds={"a": kind}, mix=URBAN)
 
+
+MERGES = {lanes: partial(merge, lanes) for lanes in (2, 3)}
+two_way, all_way = partial(crossing, "priority_stop"), partial(crossing, "allway_stop")
 
 # --- what is measured --------------------------------------------------------------------------------
 
@@ -430,10 +434,9 @@ def cells() -> list[Cell]:
     found = []
     through = ("in", "out")
     for rate in (4200.0, 7200.0):
-        case = "motorway", motorway, {through: rate}
-        said = f"{rate:,.0f} veh/h on three lanes"
+        demand, said = {through: rate}, f"{rate:,.0f} veh/h on three lanes"
         add = lambda what, unit, measure, real, source: found.append(  # noqa: E731
-            Cell("motorway", f"{said}: {what}", unit, motorway, case[2], measure, real, source)  # noqa: B023
+            Cell("motorway", f"{said}: {what}", unit, motorway, demand, measure, real, source)  # noqa: B023
         )
         add("served per lane, best 5 min", "veh/h", lambda s: best_five(s, "out") / 3,
             "2,000 to 2,400" if rate > 6000 else "", "HCM 6, chapter 12")  # fmt: skip
@@ -444,7 +447,7 @@ def cells() -> list[Cell]:
     for lanes, main, ramp in ((2, 2400, 800), (2, 3000, 500), (2, 3600, 800), (3, 3600, 1200)):
         demand = {("in", "out"): float(main), ("ramp", "out"): float(ramp)}
         said = f"{lanes} lanes, {main:,} + {ramp:,} veh/h"
-        make = {2: merge_two, 3: merge_three}[lanes]
+        make = MERGES[lanes]
         found.append(Cell("merge", f"{said}: served", "veh/h", make, demand, lambda s: flow(s, "out"),
                           f"{main + ramp:,} asked"))  # fmt: skip
         found.append(
@@ -484,26 +487,6 @@ def cells() -> list[Cell]:
     return found
 
 
-def merge_two() -> Site:
-    """Two lanes."""
-    return merge(2)
-
-
-def merge_three() -> Site:
-    """Three lanes."""
-    return merge(3)
-
-
-def two_way() -> Site:
-    """Stop signs on the minor road."""
-    return crossing("priority_stop")
-
-
-def all_way() -> Site:
-    """Stop signs on all arms."""
-    return crossing("allway_stop")
-
-
 def _said(x: float) -> str:
     return f"{x:.2f}" if x < 2 else f"{x:,.0f}"
 
@@ -521,7 +504,8 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def main() -> None:
     """Parse the command line, run, write."""
-    every = list(dict.fromkeys(cell.site for cell in cells()))
+    wanted = cells()
+    every = list(dict.fromkeys(cell.site for cell in wanted))
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--worlds", type=int, default=4)
     parser.add_argument("--minutes", type=float, default=15.0)
@@ -536,7 +520,8 @@ def main() -> None:
     file = RESULTS / "capacity.json"
     kept = {r["what"]: r for r in json.loads(file.read_text())["rows"]} if file.exists() else {}
     done: dict[Any, tuple[Seen, Seen]] = {}
-    for cell in cells():
+    order = [cell.what for cell in wanted]
+    for cell in wanted:
         if cell.site not in options.sites:
             continue
         key = cell.make, tuple(cell.demand.items())
@@ -553,8 +538,7 @@ def main() -> None:
         kept[cell.what] = {"site": cell.site, "what": cell.what, "unit": cell.unit, "ours": of_us,
                            "SUMO": of_sumo, "real": cell.real, "source": cell.source}  # fmt: skip
         print(json.dumps(kept[cell.what]), flush=True)
-        order = [x.what for x in cells()]
-        rows = sorted(kept.values(), key=lambda r: order.index(r["what"]) if r["what"] in order else 999)
+        rows = sorted((r for name, r in kept.items() if name in order), key=lambda r: order.index(r["what"]))
         write_whole(file, json.dumps({"rows": rows}, indent=1) + "\n")
         head = "Regenerate: `python experiments/capacity.py`\n\n"
         write_whole(file.with_suffix(".md"), head + table(rows) + "\n")

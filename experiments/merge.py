@@ -20,6 +20,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from capacity import FAST, WIDTH, Road, Site
 from watch import STANDS, Changes
 
 from limsim_jax.files import write_whole
@@ -38,44 +39,32 @@ MOTORWAY = (1200.0, 2400.0, 3600.0, 4800.0)  # veh/h on its three lanes
 HORIZON = 600.0  # s
 SLOTS = 256
 DT = 0.1  # s, of both
-FAST, SLOW = 33.33, 22.22  # m/s
+SLOW = 22.22  # m/s
 UPSTREAM, DOWNSTREAM, RAMP = 800.0, 600.0, 300.0  # m
-WIDTH = 3.2  # m, netconvert's lanes
 
 
 def network(case: str, length: float, folder: Path) -> Path:
     """A motorway with a ramp, from SUMO's netconvert."""
-    from maps_against_sumo import run_sumo  # needs SUMO
-
     on, edge = case == "on", -3 * WIDTH  # lanes lie to the right of their edge
     course = [(-RAMP, edge - 0.1 * RAMP), (-RAMP / 3, edge), (0.0, edge)]
     course = course if on else [(length - x, y) for x, y in reversed(course)]
-    points = {"west": (-UPSTREAM, 0), "a": (0, 0), "b": (length, 0), "east": (length + DOWNSTREAM, 0)}
-    points["far"] = course[0 if on else -1]
-    nodes = [f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in points.items()]
-    roads = {"before": ("west", "a", 3, FAST), "beside": ("a", "b", 4, FAST), "after": ("b", "east", 3, FAST)}
-    roads["ramp"] = ("far", "a", 1, SLOW) if on else ("b", "far", 1, SLOW)
-    edges = [
-        f'<edge id="{name}" from="{a}" to="{b}" numLanes="{lanes}" speed="{speed}"/>'
-        for name, (a, b, lanes, speed) in roads.items()
-    ]
-    shape = " ".join(f"{x},{y}" for x, y in course)
-    edges[-1] = edges[-1].replace("/>", f' shape="{shape}"/>')
-    links = [("before", k, "beside", k + 1) for k in range(3)] + [
-        ("beside", k + 1, "after", k) for k in range(3)
-    ]
+    nodes = {
+        "west": (-UPSTREAM, 0.0),
+        "a": (0.0, 0.0),
+        "b": (length, 0.0),
+        "east": (length + DOWNSTREAM, 0.0),
+    }
+    nodes["far"] = course[0 if on else -1]
+    roads = {
+        "before": Road("west", "a", 3, FAST),
+        "beside": Road("a", "b", 4, FAST),
+        "after": Road("b", "east", 3, FAST),
+        "ramp": Road("far", "a", 1, SLOW, course) if on else Road("b", "far", 1, SLOW, course),
+    }
+    links = [("before", k, "beside", k + 1) for k in range(3)]
+    links += [("beside", k + 1, "after", k) for k in range(3)]
     links.append(("ramp", 0, "beside", 0) if on else ("beside", 0, "ramp", 0))
-    joints = [f'<connection from="{a}" fromLane="{k}" to="{b}" toLane="{j}"/>' for a, k, b, j in links]
-    for name, kind, lines in (
-        ("nod", "nodes", nodes),
-        ("edg", "edges", edges),
-        ("con", "connections", joints),
-    ):
-        (folder / f"{name}.xml").write_text(f"<{kind}>{''.join(lines)}</{kind}>")
-    net = folder / f"{case}.net.xml"
-    parts = f"-n {folder}/nod.xml -e {folder}/edg.xml -x {folder}/con.xml"
-    run_sumo("netconvert", f"--no-turnarounds true {parts} -o {net}")
-    return net
+    return Site(nodes, roads, links).write(folder)
 
 
 def flows(case: str, motorway: float, ramp: float) -> list[tuple[str, str, float]]:

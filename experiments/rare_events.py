@@ -4,8 +4,8 @@
     python experiments/rare_events.py --quick            fewer repetitions
     python experiments/rare_events.py --worlds [--full]  contacts in worlds, sampled and counted
 
-Writes experiments/results/rare_events.json and .md, or rare_worlds.json and .md. Worlds that ran lie in
-results/rare_worlds, and the command goes on from there.
+Writes experiments/results/rare_events.json and .md, or rare_worlds.json and .md; without `--full`
+rare_worlds_work. Worlds that ran lie in results/rare_worlds, and the command goes on from there.
 """
 
 from __future__ import annotations
@@ -151,7 +151,9 @@ WORLDS = (
     ("highway", "pdm_closed", "fault", 1_500, 1_500),
     ("highway", "limsim_tm", "fault", 1_100, 400),
 )
-"""Scenario, policy, event, and worlds for subset simulation and for counting; without `--full`, a tenth."""
+"""Scenario, policy, event, worlds for subset simulation, and for counting.
+
+Without `--full` it is a tenth of them; subset simulation has at least `LEAST`."""
 
 
 LEAST = 1_100
@@ -165,7 +167,7 @@ def worlds(full: bool) -> None:
     """
     import limsim_jax as lj
 
-    found = []
+    found, name = [], "rare_worlds" if full else "rare_worlds_work"
     for scenario, policy, event, sampled, counted in WORLDS:
         methods: tuple[tuple[Any, int, int], ...] = (("subset", sampled, 0), ("crude", counted, 1))
         for method, budget, seed in methods:
@@ -175,7 +177,7 @@ def worlds(full: bool) -> None:
                 scenario, event, policy=policy, method=method, worlds=budget, seed=seed, out=out
             )  # fmt: skip
             found.append(one.as_json())
-            write("rare_worlds", {"rows": found}, worlds_text({"rows": found}))
+            write(name, {"rows": found}, worlds_text({"rows": found}))
 
 
 def _round(x: float) -> str:

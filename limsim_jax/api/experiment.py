@@ -319,9 +319,6 @@ def _number(x: float | None) -> float | None:
     return float(x) if isinstance(x, int) and not isinstance(x, bool) else x
 
 
-__all__ = ["Action", "Ego", "Experiment", "Flow", "Obstacle", "Vehicle", "Zone", "load_experiments"]
-
-
 def one_experiment(experiment: Experiment | str | Path, do: str) -> Experiment:
     """The only experiment.
 
@@ -333,3 +330,16 @@ def one_experiment(experiment: Experiment | str | Path, do: str) -> Experiment:
     if len(experiments) != 1:
         raise ValueError(f"experiment: {len(experiments)} scenarios at once; {do} them one by one")
     return experiments[0]
+
+
+__all__ = [
+    "Action",
+    "Ego",
+    "Experiment",
+    "Flow",
+    "Obstacle",
+    "Vehicle",
+    "Zone",
+    "load_experiments",
+    "one_experiment",
+]

@@ -175,7 +175,7 @@ def _signals(
     wrong = (state.status & int(Status.WRONG_WAY)) != 0
     waits = red[following] & (v < _STANDS) & (lane_map.stop_s[lane] - s < AT_RED)
     return _Signals(
-        red_light=crosses_on_red(lane_map, state, dx)[slot],
+        red_light=crosses_on_red(lane_map, state, dx, slot),
         stop_sign=entered[slot] & signed,
         waits=waits,
         violation=ran | wrong,

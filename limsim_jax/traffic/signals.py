@@ -66,10 +66,11 @@ def switch(
     )
 
 
-def crosses_on_red(lane_map: LaneMap, state: State, dx: Float[Array, " N"]) -> Bool[Array, " N"]:
-    """Vehicles that have run a red light in the last `dx` m.
+def crosses_on_red(
+    lane_map: LaneMap, state: State, dx: Float[Array, " N"], slot: Int[Array, ""] | None = None
+) -> Bool[Array, "*N"]:
+    """Whether vehicles have run a red light in the last `dx` m.
 
-    Their front has come over the stop line.
     The line may stand well before the end of its lane: what counts is the light when the front passes the
     line, not when the vehicle enters the junction.
 
@@ -77,12 +78,15 @@ def crosses_on_red(lane_map: LaneMap, state: State, dx: Float[Array, " N"]) -> B
       lane_map: where.
       state: after the way.
       dx: m driven.
+      slot: of the only vehicle that is asked for; None: all.
     """
-    entered = (state.previous != NO_LANE) & (state.s <= dx)
-    lane = jnp.where(entered, state.previous, state.lane)
-    onto = jnp.where(entered, state.lane, lane_map.routes.next_lane[state.lane, state.goal])
-    front = state.s + jnp.where(entered, lane_map.length[lane], 0)
+    asked = state.active, state.lane, state.previous, state.goal, state.s, dx
+    active, here, previous, goal, s, dx = asked if slot is None else (x[slot] for x in asked)
+    entered = (previous != NO_LANE) & (s <= dx)
+    lane = jnp.where(entered, previous, here)
+    onto = jnp.where(entered, here, lane_map.routes.next_lane[here, goal])
+    front = s + jnp.where(entered, lane_map.length[lane], 0)
     line = jnp.minimum(lane_map.stop_s[lane] + ON_LINE, lane_map.length[lane])
     red = lane_states(lane_map.signals, state.lights.phase) == SignalState.RED
-    crossed = state.active & (front - dx <= line) & (front > line) & (lane != NO_LANE)
+    crossed = active & (front - dx <= line) & (front > line) & (lane != NO_LANE)
     return crossed & (onto != NO_LANE) & red[onto]

@@ -410,7 +410,7 @@ _FILLERS: tuple[tuple[str, Effect], ...] = (
     (r"(?:an?|the|and|then|but|with|on|at|in|of|to|for|so|there|is|are|was|has|while|when|as|after|suddenly|"
      r"abruptly|roads?|lanes?|straight|dry|scenario|where|its|our|by|from|very|also|just|sharply|closely|both|"
      r"ahead|in front|way|path|onto|into|over|immediately|unexpectedly|traffic|again|during|please|simulate|"
-     r"show|create|test|appears?|shows up|becomes visible|comes into (?:view|sight)|path|across)", nothing),
+     r"show|create|test|appears?|shows up|becomes visible|comes into (?:view|sight)|across)", nothing),
 )  # fmt: skip
 
 PHRASES = tuple(

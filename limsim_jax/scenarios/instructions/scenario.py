@@ -13,6 +13,7 @@ import numpy as np
 from limsim_jax.files import write_whole
 from limsim_jax.maps import bundled_maps
 from limsim_jax.maps.map import Map, load_map
+from limsim_jax.scenarios.instructions.draft import UNITS
 from limsim_jax.scenarios.instructions.events import happened
 from limsim_jax.scenarios.instructions.grammar import parse
 from limsim_jax.scenarios.instructions.intent import Act, InstructionError, Intent, RoadKind
@@ -196,14 +197,14 @@ def _within_grip(intent: Intent) -> Intent:
     """The same; no vehicle brakes harder than the road allows."""
     if intent.friction is None:
         return intent
-    most = round(GRIP * intent.friction * 9.81, 2)
+    most = round(GRIP * intent.friction * UNITS["g"], 2)
 
     def slower(act: Act) -> Act:
         rate = min(STEADY if act.rate is None else act.rate, most)
         return act.model_copy(update={"rate": rate}) if act.kind == "brake" else act
 
-    actors = [x.model_copy(update={"acts": type(x.acts)(map(slower, x.acts))}) for x in intent.actors]
-    return intent.model_copy(update={"actors": type(intent.actors)(actors)})
+    actors = tuple(x.model_copy(update={"acts": tuple(map(slower, x.acts))}) for x in intent.actors)
+    return intent.model_copy(update={"actors": actors})
 
 
 def severity(made: Scenario, seeds: int = SEEDS) -> list[tuple[float, Scenario]]:
@@ -308,13 +309,13 @@ def _file(text: str, intent: Intent, placed: Placed) -> ExperimentFile:
         zones.append({"speed_limit": round(limit, 2)})
     if intent.friction is not None:
         zones.append({"friction": intent.friction})
-    grip = 1.0 if intent.friction is None else intent.friction
+    slow = placed.signalled or (intent.friction is not None and intent.friction < SLIPPERY)
     density = DENSITY[intent.traffic or "none"]
     named = len(placed.vehicles) + len(placed.obstacles)
     return ExperimentFile.model_validate(
         {
             "name": slug(text), "map": _name_of(placed.map), "description": text.strip(),
-            "horizon": LONGER if placed.signalled or grip < SLIPPERY else HORIZON,
+            "horizon": LONGER if slow else HORIZON,
             "slots": _slots(placed.map, density, named),
             "traffic": {"density": density}, "zone": zones,
             "ego": placed.ego | {"policy": REFERENCE, "driver": KEEPS_LANE},
