@@ -18,7 +18,7 @@ import json
 import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -39,8 +39,15 @@ from limsim_jax.simulation.rollout import Rollout, started
 from limsim_jax.simulation.worlds import over_worlds
 from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Traffic
-from limsim_jax.traffic.vehicles import HIGHWAY, URBAN, default_population, restrict_to_map
-from limsim_jax.types import Config
+from limsim_jax.traffic.vehicles import (
+    HIGHWAY,
+    URBAN,
+    default_population,
+    restrict_to_map,
+    sample,
+    uniform_population,
+)
+from limsim_jax.types import Config, Scenario
 from limsim_jax.xla import enable_compilation_cache, use_all_cores
 
 RESULTS = Path(__file__).parent / "results"
@@ -79,6 +86,7 @@ class Site:
     mix: Mapping[str, float] = field(default_factory=lambda: HIGHWAY)
     options: str = ""
     lights: str = ""  # a file of programs
+    standing: tuple[str, float] | None = None  # lane, and m along it, where a car stands all the time
 
     def write(self, folder: Path) -> Path:
         """Make the network."""
@@ -155,6 +163,13 @@ def weaving(length: float = 300.0) -> Site:
     links = [("in", 0, "beside", 1), ("in", 1, "beside", 2), ("ramp", 0, "beside", 0)]
     links += [("beside", 1, "out", 0), ("beside", 2, "out", 1), ("beside", 0, "exit", 0)]
     return Site(nodes, roads, links)
+
+
+def standing() -> Site:
+    """Two lanes; a car stands on the right one."""
+    nodes = {"west": (0.0, 0.0), "middle": (1000.0, 0.0), "east": (1300.0, 0.0)}
+    roads = {"in": Road("west", "middle", 2, RAMP), "out": Road("middle", "east", 2, RAMP)}
+    return Site(nodes, roads, mix=URBAN, standing=("in_0", 800.0))
 
 
 def signal() -> Site:
@@ -245,6 +260,12 @@ def best_five(seen: Seen, road: str) -> float:
     return float(np.mean(most))
 
 
+def longest_gap(seen: Seen, road: str) -> float:
+    """Longest time (s) without a vehicle onto a road, after the warm-up."""
+    end = WARM + 3600 * seen.hours
+    return float(max(np.diff([WARM, *t[t >= WARM], end]).max() for t in times(seen, road)))
+
+
 def saturation(seen: Seen, road: str) -> float:
     """veh/h from the fifth vehicle of each green on."""
     gaps: list[float] = []
@@ -283,13 +304,33 @@ def program(minutes: float) -> tuple[Any, Any]:
     run = Rollout(config, Traffic(), 60 * minutes, record=record)
 
     def start(shared: Any, seed: Any) -> Any:
-        lane_map, demand = shared
-        return started(run, lane_map, lambda key: sample_scenario(demand, lane_map, key, SLOTS), seed)
+        lane_map, demand, lane, s = shared
+
+        def sampler(key: Any) -> Scenario:
+            return _with_standing(sample_scenario(demand, lane_map, key, SLOTS), lane, s)
+
+        return started(run, lane_map, sampler, seed)
 
     def advance(shared: Any, world: Any) -> Any:
         return run.advance(shared[0], *world)[0].trace
 
     return over_worlds(start, mesh), over_worlds(advance, mesh)
+
+
+def _with_standing(scenario: Scenario, lane: Any, s: Any) -> Scenario:
+    """The scenario and a car that stands on a lane.
+
+    It takes the last slot; for a lane of -1 there is none.
+    """
+    x, last = scenario.start, (jnp.arange(SLOTS) == SLOTS - 1) & (lane >= 0)
+    driver, shape = sample(
+        uniform_population("car", v_max=0.0, politeness=0.0, threshold=1000.0), jax.random.key(0)
+    )
+    put = lambda new, old: jnp.where(last, jnp.asarray(new, old.dtype), old)  # noqa: E731
+    mix = lambda new, old: jax.tree.map(put, new, old)  # noqa: E731
+    start = replace(x, driver=mix(driver, x.driver), shape=mix(shape, x.shape), lane=put(lane, x.lane),
+                    s=put(s, x.s), v=put(0.0, x.v), goal=put(0, x.goal), active=x.active | last)  # fmt: skip
+    return replace(scenario, start=start)
 
 
 def ours(site: Site, net: Path, demand: Mapping[tuple[str, str], float], worlds: int, minutes: float) -> Seen:
@@ -304,9 +345,10 @@ def ours(site: Site, net: Path, demand: Mapping[tuple[str, str], float], worlds:
     )  # fmt: skip
     start, advance = program(minutes)
     count = -(-worlds // jax.local_device_count()) * jax.local_device_count()
-    shared = (lane_map, spec)
-    lanes, speeds, who = jax.device_get(advance(shared, start(shared, np.arange(count, dtype=np.int32))))
     ids = lane_ids(network)
+    name, s = site.standing or ("", 0.0)
+    shared = (lane_map, spec, jnp.int32(ids.index(name) if name else -1), jnp.float32(s))
+    lanes, speeds, who = jax.device_get(advance(shared, start(shared, np.arange(count, dtype=np.int32))))
     roads = [name.rsplit("_", 1)[0] for name in ids]
     of = np.array([*(list(site.roads).index(x) if x in site.roads else -1 for x in roads), -1])
     return _seen(site, ids, of, lanes[:worlds], speeds[:worlds] / 100, who[:worlds])
@@ -367,6 +409,11 @@ def theirs(
         for (a, b), rate in demand.items() if rate > 0
     )  # fmt: skip
     routes, log = net.with_name("site.rou.xml"), net.with_name("changes.xml")
+    if site.standing is not None:
+        lane, s = site.standing
+        edge, at = lane.rsplit("_", 1)
+        first = f'<trip id="stands" depart="0" from="{edge}" to="out" departLane="{at}" departPos="{s - 50}">'
+        flows = f'{first}<stop lane="{lane}" endPos="{s}" duration="1e6"/></trip>{flows}'
     routes.write_text(f"<routes>{flows}</routes>")
     here = list(site.roads)
     passes: dict[tuple[str, str], list[NDArray]] = {(a, b): [] for a in here for b in here if a != b}
@@ -459,6 +506,12 @@ def cells() -> list[Cell]:
     demand = {through: 2400.0, ("ramp", "out"): 800.0, ("in", "exit"): 800.0}
     found.append(Cell("weaving", "2,400 through, 800 on, 800 off: served", "veh/h", weaving, demand,
                       lambda s: flow(s, "out") + flow(s, "exit"), *TWO_LANES))  # fmt: skip
+    for rate in (600.0, 1500.0):
+        said, demand = f"a car stands on one of two lanes, {rate:,.0f} veh/h", {through: rate}
+        found.append(Cell("standing car", f"{said}: served", "veh/h", standing, demand,
+                          lambda s: flow(s, "out"), f"{rate:,.0f} asked"))  # fmt: skip
+        found.append(Cell("standing car", f"{said}: longest time in which none passes", "s", standing, demand,
+                          lambda s: longest_gap(s, "out"), ""))  # fmt: skip
     found.append(Cell("signal", "saturation flow from the fifth on", "veh/h", signal,
                       {through: 1800.0, ("side", "away"): 60.0}, lambda s: saturation(s, "out"),
                       "1,800 to 1,950", "HCM 6, chapter 19"))  # fmt: skip

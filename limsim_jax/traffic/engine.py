@@ -65,6 +65,7 @@ from limsim_jax.traffic.script import (
 )
 from limsim_jax.traffic.signals import crosses_on_red, switch
 from limsim_jax.traffic.speeds import BEND_POINTS, bend_squares, lane_speed
+from limsim_jax.traffic.standing import obstructed, pulling_out
 from limsim_jax.types import Actions, Config, Schedule, State, Status
 from limsim_jax.xla import computed_once, mapped_like
 
@@ -140,11 +141,12 @@ def decide(
     found = computed_once(found)
     own, second, new = (jax.tree.map(lambda x: x[:, k], found) for k in range(3))  # noqa: B023
     own = _behind_tails(lane_map, state, ahead, own)
+    blocked = obstructed(lane_map, state, own)
     if traffic.lane_changes:
         choice = choose_lane(
-            traffic.model, lane_map, state, v0, own, new, beside, beside_s, allowed, side, turn
+            traffic.model, lane_map, state, v0, own, new, beside, beside_s, allowed, side, turn, blocked.there
         )
-        choice = choice._replace(side=jnp.where(is_free(state), 0, choice.side))
+        choice = choice._replace(side=jnp.where(is_free(state) | blocked.stands, 0, choice.side))
     else:
         choice = _stay(state)
     if command.meta is not None:
@@ -169,7 +171,8 @@ def decide(
     end = jnp.maximum(
         end - choice.stops_before, jnp.minimum(end, state.v * state.v / (2 * DRIVING.gentle_braking))
     )
-    stop_obstacle = jnp.minimum(end, way.stop + state.driver.s0)
+    stop_obstacle = jnp.minimum(jnp.minimum(end, way.stop + state.driver.s0), blocked.stop)
+    own, second = pulling_out(lane_map, state, blocked.stands, own, second)
     obstacles = Obstacles(
         jnp.stack([own.lead, second.lead, way.lead, jnp.full_like(own.lead, -1)], -1),
         jnp.stack([own.lead_gap, second.lead_gap, way.lead_gap, stop_obstacle], -1),
@@ -293,7 +296,7 @@ def _speeds(
     """
     driver = state.driver
     v0 = desired_speed(driver, lane_map.speed_limit[state.lane], curvature(lane_map, state.lane, state.s))
-    v0 = jnp.minimum(v0, _until_changed(lane_map, state))
+    v0 = jnp.minimum(v0, jnp.minimum(_until_changed(lane_map, state), _for_several(lane_map, state)))
     # lanes to come: limit and tightest bend
     speed = lane_speed(lane_map, driver, ahead.lane[:, 1:])
     # the own lane: its bend at a few places within braking distance
@@ -319,6 +322,17 @@ def _until_changed(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
     # a much faster vehicle, as one that a planner has driven, does not brake hard for that
     least = jnp.maximum(LANE_CHANGES.slowed * state.v, creep_speed(state))
     return jnp.where(state.side != 0, jnp.maximum(LANE_CHANGES.on_time * room / time, least), NO_GAP)
+
+
+def _for_several(lane_map: LaneMap, state: State) -> Float[Array, " N"]:
+    """Speed (m/s) at which several lane changes fit into their way.
+
+    NO_GAP for vehicles that need one or none.
+    """
+    count = jnp.abs(lane_map.routes.lanes_to_go[state.lane, state.goal])
+    room = lane_map.routes.change_distance[state.lane, state.goal] - state.s
+    time = jnp.maximum(count.astype(room.dtype) * state.driver.lane_change_time, 0.1)
+    return jnp.where(count > 1, jnp.maximum(room / time, creep_speed(state)), NO_GAP)
 
 
 @jax.named_scope("drive")

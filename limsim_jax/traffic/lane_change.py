@@ -18,7 +18,7 @@ from limsim_jax.maps.lane_map import NO_LANE, LaneMap, room_beside, side_s, widt
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
 from limsim_jax.traffic.motion import creep_speed
 from limsim_jax.traffic.neighbors import Obstacles, Pair
-from limsim_jax.traffic.parameters import LANE_CHANGES
+from limsim_jax.traffic.parameters import DRIVING, LANE_CHANGES
 from limsim_jax.types import State
 from limsim_jax.xla import computed_once
 
@@ -125,7 +125,9 @@ def place_beside(
     # time to finish before the lanes part: mean speed while braking with two thirds of b
     time = state.driver.lane_change_time
     mean = jnp.maximum(state.v - state.driver.b * time / 3, LANE_CHANGES.slowed * state.v)
-    needed = jnp.maximum(mean, LANE_CHANGES.way_over * creep_speed(state)) * time
+    # a vehicle that has stopped too near to the end turns harder after a while
+    share = jnp.where(state.waiting > DRIVING.patience, LANE_CHANGES.way_least, LANE_CHANGES.way_over)
+    needed = jnp.maximum(mean, share * creep_speed(state)) * time
     allowed &= room_beside(lane_map, state.lane, state.s, side) > needed
     # where it crosses the border, in the middle of the change, its rear is on a lane that is wide enough
     s = side_s(lane_map, state.lane, state.s, side)
@@ -148,6 +150,7 @@ def choose_lane(
     allowed: Bool[Array, " N"],
     side: Int[Array, " N"],
     turn: Int[Array, ""],
+    blocked: Bool[Array, " N"],
 ) -> LaneChoice:
     """The lane change that each vehicle wants and may start now.
 
@@ -166,20 +169,26 @@ def choose_lane(
       allowed: whether the vehicle may change to it.
       side: of that lane, +1 left, -1 right.
       turn: the side to which changes may start at this decision.
+      blocked: behind a vehicle that stands for good.
     """
     driver, shape = state.driver, state.shape
     me = jnp.arange(state.lane.shape[0], dtype=jnp.int32)
     routes = lane_map.routes
     to_go = routes.lanes_to_go[state.lane, state.goal]
-    press = computed_once(_urgency(lane_map, state))
+    press = _urgency(lane_map, state)
     wanted = jnp.sign(to_go)
     reachable = routes.reachable[lane, state.goal]
     # a lane on the wanted side may be the wrong one: the change may be possible only further on
     farther = routes.distance[lane, state.goal] > routes.distance[state.lane, state.goal]
     back_to_go = routes.lanes_to_go[lane, state.goal]
     back = routes.change_distance[lane, state.goal] - s
-    found = wanted, reachable, farther, back_to_go, back
-    wanted, reachable, farther, back_to_go, back = computed_once(found)
+    # past a vehicle that stands for good either side will do
+    passes = blocked & (to_go == 0)
+    way = urgency(jnp.ones_like(to_go), own.lead_gap, state.v, driver.lane_change_time)
+    press = jnp.where(passes, way, press)
+    wanted, farther = jnp.where(passes & allowed, side, wanted), farther & ~passes
+    found = wanted, reachable, farther, back_to_go, back, press
+    wanted, reachable, farther, back_to_go, back, press = computed_once(found)
 
     # six accelerations in one call: vehicle i follows vehicle j (-1: free road) at a gap
     between = pair.lag_gap + shape.length + pair.lead_gap  # from the new follower to the new leader
@@ -221,8 +230,11 @@ def choose_lane(
     b_safe = driver.b_safe + LANE_CHANGES.safe_urgent * press
     # the models are mild where a cut-in leaves a short gap; what the speeds ask for must not be hard either
     b_lag, b_own = (LANE_CHANGES.hardest * jnp.where(i[k] < 0, 0, driver.b_max[i[k]]) for k in (3, 1))
-    need_lag, need_own = (closing(v[k], v_lead[k], a_lead[k], gap[k]) for k in (3, 1))
-    safe = (~follower | ((new_then > -b_safe) & (need_lag < b_lag) & (pair.lag_gap > room))) & (
+    # the follower sees the change a moment later
+    lag_gap = gap[3] - LANE_CHANGES.unseen * jnp.maximum(v[3] - v_lead[3], 0)
+    need_lag = closing(v[3], v_lead[3], a_lead[3], lag_gap)
+    need_own = closing(v[1], v_lead[1], a_lead[1], gap[1])
+    safe = (~follower | ((new_then > -b_safe) & (need_lag < b_lag) & (lag_gap > room))) & (
         (pair.lead < 0) | ((own_then > -b_safe) & (need_own < b_own) & (pair.lead_gap > room))
     )
     # a change away from the route must leave time to come back
@@ -231,7 +243,8 @@ def choose_lane(
     speed = jnp.maximum(state.v, LANE_CHANGES.jam_speed)
     late = back < LANE_CHANGES.return_factor * speed * driver.lane_change_time * (count + 1)
     late |= back < LANE_CHANGES.detour_time * lane_map.speed_limit[state.lane]
-    late &= away
+    late &= away | (passes & (back_to_go != 0))
+    late &= ~(passes & (state.waiting > DRIVING.patience))
     rested = (state.rest <= 0) | (press > 0)
     starts = allowed & reachable & safe & ~late & rested & (advantage > driver.threshold) & (side == turn)
 
@@ -247,7 +260,8 @@ def choose_lane(
     letting_gap = pair.lag_gap[letting]
     # above walking speed a vehicle beside it falls back, too
     beside = (letting_gap > -shape.length) & (state.v > LANE_CHANGES.yielding_speed)
-    lets = (letting >= 0) & ((letting_gap > 0) | beside)
+    # a vehicle that has stopped too near lets nothing in, nor does one for good
+    lets = (letting >= 0) & ((letting_gap > room) | beside) & (state.waiting < LANE_CHANGES.let_time)
     letting_gap = jnp.maximum(letting_gap, room)
     courtesy = Obstacles(
         jnp.stack([jnp.where(lets, letting, -1), jnp.where(asks, pair.lead, -1)], -1),
@@ -273,6 +287,9 @@ def choose_lane(
 def start(lane_map: LaneMap, state: State, choice: LaneChoice) -> State:
     """Start the lane changes that were chosen."""
     begins = choice.side != 0
+    # after a change that the route needs, as from an acceleration lane, the next may follow at once
+    needed = jnp.sign(lane_map.routes.lanes_to_go[state.lane, state.goal]) == choice.side
+    rest = jnp.where(needed, 0, LANE_CHANGES.rest) + state.driver.lane_change_time
     beside = jnp.where(choice.side > 0, lane_map.left[state.lane], lane_map.right[state.lane])
     s_beside = side_s(lane_map, state.lane, state.s, choice.side)
     between = (width(lane_map, state.lane, state.s) + width(lane_map, beside, s_beside)) / 2
@@ -283,5 +300,5 @@ def start(lane_map: LaneMap, state: State, choice: LaneChoice) -> State:
         crossed=state.crossed & ~begins,
         progress=jnp.where(begins, 0, state.progress),
         shift=jnp.where(begins, shift, state.shift),
-        rest=jnp.where(begins, LANE_CHANGES.rest + state.driver.lane_change_time, state.rest),
+        rest=jnp.where(begins, rest, state.rest),
     )

@@ -161,8 +161,13 @@ def creep_speed(state: State) -> Float[Array, " N"]:
 
 
 def pace(state: State) -> Float[Array, " N"]:
-    """Share of their full pace at which lane changes go on: 1 from `creep_speed` on."""
-    return jnp.minimum(state.v / creep_speed(state), 1)
+    """Share of their full pace at which lane changes go on: 1 from `creep_speed` on.
+
+    A vehicle that has no room to drive shunts to and fro after a while, which shifts it slowly aside.
+    """
+    shunts = state.waiting > DRIVING.patience
+    least = jnp.where(shunts, state.driver.lane_change_time / LANE_CHANGES.shunt_time, 0)
+    return jnp.clip(state.v / creep_speed(state), least, 1)
 
 
 def smooth_step(u: Float[Array, "*b"]) -> Float[Array, "*b"]:
@@ -179,6 +184,7 @@ def _stalled(lane_map: LaneMap, state: State) -> State:
     asked = jnp.sign(lane_map.routes.lanes_to_go[state.lane, state.goal]) == state.side
     stalls = (state.crossed | ~asked) & (state.side != 0) & state.active
     stalls &= (jnp.abs(state.d) < LANE_CHANGES.stall_offset) & (state.waiting > LANE_CHANGES.stall_time)
+    stalls &= state.waiting < DRIVING.patience
     return replace(
         state,
         side=jnp.where(stalls, 0, state.side),

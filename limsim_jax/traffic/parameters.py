@@ -37,17 +37,30 @@ class Junctions:
     """Right of way, gap acceptance, lights and signs. Units, meanings and sources are in `PARAMETERS`."""
 
     gap_lead: float = _number(
-        1.5,
+        0.7,
         "s",
         "gap from leaving a conflict area to the arrival of a vehicle with priority, for a `gap_factor` of 1",
-        "chosen: with the time to cross it gives the critical gaps of 4 to 7 s of HCM (2016), ch. 20; "
-        "SUMO: jmTimegapMinor, 1 s",
+        "capacities of left turns from a major road, HCM 6, ch. 20; SUMO: jmTimegapMinor, 1 s",
         (0.3, 4.0),
+    )
+    gap_side: float = _number(
+        1.0,
+        "s",
+        "added to that where the other comes from the side, not from ahead",
+        "capacities of minor roads, HCM 6, ch. 20: critical gaps of 6.5 and 7.1 s, of the left turn 4.1 s",
+        (0.0, 3.0),
+    )
+    gap_merge: float = _number(
+        0.7,
+        "s",
+        "the same where paths merge, between the vehicle that goes first and one with priority",
+        "capacities of roundabouts, HCM 6, ch. 22",
+        (0.1, 4.0),
     )
     gap_lead_entered: float = _number(
         0.3,
         "1",
-        "factor on `gap_lead` for a vehicle that is past the stop line",
+        "factor on these gaps for a vehicle that is past the stop line",
         "chosen: a vehicle inside the junction completes its manoeuvre",
         (0.0, 1.0),
     )
@@ -94,6 +107,13 @@ class Junctions:
         "chosen: long enough to see which vehicle starts",
         (1.0, 10.0),
     )
+    turn_time: float = _number(
+        1.0,
+        "s",
+        "difference of waiting times at a four-way stop from which the first that came goes first",
+        "chosen: what drivers can tell apart",
+        (0.1, 5.0),
+    )
     priority_time: float = _number(
         20.0,
         "s",
@@ -134,6 +154,20 @@ class Junctions:
         "share of its acceleration that a vehicle counts on to pass before another",
         "chosen: on the safe side",
         (0.3, 1.0),
+    )
+    soonest: float = _number(
+        0.85,
+        "1",
+        "share of the time through a turn at its tightest speed that another vehicle may take",
+        "chosen: a turn is tight in a part of it",
+        (0.5, 1.0),
+    )
+    turn_length: float = _number(
+        15.0,
+        "m",
+        "of a connector, on which its tightest speed counts for that time",
+        "chosen: a turn",
+        (5.0, 50.0),
     )
     calm_factor: float = _number(
         2.0,
@@ -212,7 +246,16 @@ class Junctions:
         "chosen: a driver stops before the line or at it",
         (0.5, 5.0),
     )
-    sign_speed: float = _number(0.3, "m/s", "speed that counts as a stop at a sign", "chosen", (0.0, 1.0))
+    sign_speed: float = _number(
+        1.0,
+        "m/s",
+        "speed that counts as a stop at a sign, except of egos",
+        "most drivers roll; with it roads with a stop sign have the follow-up times of HCM 6, ch. 20",
+        (0.0, 2.0),
+    )
+    sign_stop: float = _number(
+        0.3, "m/s", "speed that counts as a stop of an ego at a sign", "chosen: a full stop", (0.0, 1.0)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -300,10 +343,10 @@ class LaneChanging:
         (0.5, 10.0),
     )
     rest: float = _number(
-        4.0,
+        10.0,
         "s",
         "from the end of a lane change to the next voluntary one",
-        "chosen: no zigzag",
+        "chosen: few are reversed within 15 s",
         (0.0, 30.0),
     )
     return_factor: float = _number(
@@ -326,6 +369,13 @@ class LaneChanging:
     stall_time: float = _number(
         3.0, "s", "standing in a lane change, after which it is given up", "chosen", (1.0, 30.0)
     )
+    shunt_time: float = _number(
+        15.0,
+        "s",
+        "of a lane change by a vehicle that has stood for `patience`: it shunts to and fro",
+        "chosen; a car gets out of a parking space in about that time",
+        (5.0, 60.0),
+    )
     stall_offset: float = _number(
         1.0,
         "m",
@@ -340,12 +390,18 @@ class LaneChanging:
         "chosen: in a queue no vehicle has to fall back",
         (0.0, 10.0),
     )
+    let_time: float = _number(
+        10.0, "s", "standing to let another vehicle in, after which a driver goes on", "chosen", (3.0, 60.0)
+    )
     hardest: float = _number(
         0.5,
         "1",
         "share of b_max that a lane change may ask of any vehicle, however urgent it is",
         "chosen: b_safe of most drivers",
         (0.2, 1.0),
+    )
+    unseen: float = _number(
+        0.5, "s", "from the start of a lane change until the new follower sees it", "a decision", (0.0, 2.0)
     )
     room: float = _number(0.5, "m", "least gap to the new leader and the new follower", "chosen", (0.1, 5.0))
     courtesy_braking: float = _number(
@@ -354,6 +410,20 @@ class LaneChanging:
         "hardest braking to let another vehicle in, or to find a gap",
         "chosen: the comfortable deceleration of cars",
         (0.5, 4.0),
+    )
+    beside_room: float = _number(
+        0.35,
+        "m",
+        "to the side, from which a vehicle is clear of its leader on the lane that it leaves",
+        "chosen: a mirror and a hand",
+        (0.1, 1.0),
+    )
+    nearer: float = _number(
+        0.7,
+        "1",
+        "share of s0 that a vehicle which pulls out needs less to one that stands for good",
+        "chosen: drivers steer with half a metre left",
+        (0.0, 0.9),
     )
     least_way: float = _number(
         12.0,
@@ -368,6 +438,13 @@ class LaneChanging:
         "share of that way which must be left before lanes part",
         "a tenth of the way aside is left then: 1 - the quintic at 0.75",
         (0.5, 1.0),
+    )
+    way_least: float = _number(
+        0.4,
+        "1",
+        "the same for a vehicle that has stood there for `patience`",
+        "chosen: it cuts the corner, and no vehicle stands for good",
+        (0.1, 1.0),
     )
     long_way: float = _number(
         2.5, "1", "least way over the length of a long vehicle", "chosen: its rear swings little", (0.5, 5.0)
@@ -478,6 +555,33 @@ class Driving:
         "braking at most to leave room for a vehicle that has to cross over",
         "chosen",
         (1.0, 5.0),
+    )
+    stand_speed: float = _number(
+        0.1, "m/s", "speed below which a vehicle may stand for good", "SUMO", (0.01, 1.0)
+    )
+    stand_time: float = _number(
+        8.0,
+        "s",
+        "standing without a reason, after which others drive around a vehicle",
+        "chosen: long for a driver behind; after a crash at once",
+        (2.0, 60.0),
+    )
+    stand_room: float = _number(
+        15.0,
+        "m",
+        "free before it, to the next vehicle and to a line: otherwise it waits there",
+        "chosen: three cars",
+        (5.0, 50.0),
+    )
+    stand_braking: float = _number(
+        4.0,
+        "m/s^2",
+        "braking up to which a driver leaves room to drive around a vehicle that stands for good",
+        "chosen: firm",
+        (1.0, 8.0),
+    )
+    stand_sight: float = _number(
+        300.0, "m", "from which a driver sees that a vehicle stands for good", "chosen", (30.0, 300.0)
     )
     goal_room: float = _number(
         2.0,

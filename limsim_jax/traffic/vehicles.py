@@ -188,12 +188,12 @@ DEFAULTS: dict[str, Parameter] = {
     "T": Parameter(
         meaning="time gap",
         unit="s",
-        median=(1.2, 1.2, 1.6, 1.6, 1.1, 1.1),
+        median=(1.0, 1.0, 1.35, 1.35, 0.9, 0.9),
         spread=0.25,
         loading=-0.7,
         bounds=(0.6, 3.0),
         vtype="tau",
-        source=f"between 1.0 (Treiber, Kesting 2013, Tab. 11.2) and 1.5 ({_ACC}); trucks 4/3 of cars",
+        source="Treiber, Kesting (2013), Tab. 11.2: 1.0; trucks 4/3 of cars",
     ),
     "s0": Parameter(
         meaning="standstill gap",
@@ -208,11 +208,11 @@ DEFAULTS: dict[str, Parameter] = {
     "a": Parameter(
         meaning="largest acceleration",
         unit="m/s^2",
-        median=(1.5, 1.3, 0.8, 1.0, 2.5, 1.8),
+        median=(1.9, 1.7, 1.0, 1.2, 2.8, 2.2),
         spread=0.2,
         loading=0.6,
         vtype="accel",
-        source=f"{_ACC}: cars 1.4, trucks 0.7; SUMO defaults: buses 1.2",
+        source=f"between {_ACC}, 1.4 and 0.7, and SUMO, 2.6 and 1.3: saturation flow of HCM 6, ch. 19",
     ),
     "b": Parameter(
         meaning="comfortable deceleration",
@@ -250,7 +250,7 @@ DEFAULTS: dict[str, Parameter] = {
     "politeness": Parameter(
         meaning="MOBIL p, weight of others' accelerations",
         unit="1",
-        median=(0.25, 0.25, 0.25, 0.25, 0.25, 0.1),
+        median=(0.4, 0.4, 0.4, 0.4, 0.4, 0.2),
         spread=0.5,
         loading=-0.6,
         bounds=(0.0, 1.0),
@@ -259,10 +259,10 @@ DEFAULTS: dict[str, Parameter] = {
     "threshold": Parameter(
         meaning="MOBIL a_th, least advantage of a lane change",
         unit="m/s^2",
-        median=(0.15,) * _ALL,
+        median=(0.4,) * _ALL,
         spread=0.3,
         loading=-0.3,
-        source=f"{_MOBIL}: 0.1; traffic-simulation.de: 0.2",
+        source=f"above the 0.1 of {_MOBIL}, for the lane changes of Knoop et al. (2012), TRR: 0.5 per km",
     ),
     "b_safe": Parameter(
         meaning="braking that a lane change may ask of the follower",
@@ -276,8 +276,8 @@ DEFAULTS: dict[str, Parameter] = {
     "keep_right": Parameter(
         meaning="MOBIL bias towards the outer lane, where the map asks for it",
         unit="m/s^2",
-        median=(0.3,) * _ALL,
-        source=_MOBIL,
+        median=(0.15,) * _ALL,
+        source=f"half of the 0.3 of {_MOBIL}: the left lane carries most at high flows",
     ),
     "lane_change_time": Parameter(
         meaning="duration of a lane change",
@@ -291,10 +291,10 @@ DEFAULTS: dict[str, Parameter] = {
     "a_lat": Parameter(
         meaning="lateral acceleration accepted in bends",
         unit="m/s^2",
-        median=(2.5, 2.3, 1.8, 1.5, 3.0, 3.0),
+        median=(3.2, 3.0, 2.3, 1.9, 3.5, 3.5),
         spread=0.15,
         loading=0.5,
-        source="comfort of passengers; SUMO limits the speed of turns at 5.5",
+        source="NCHRP Report 672 (2010), ch. 6: 25 km/h at a radius of 16 m; SUMO limits turns at 5.5",
     ),
     "gap_factor": Parameter(
         meaning="factor on the gaps accepted at junctions",

@@ -195,8 +195,9 @@ def test_drivers_are_learned_from_speed_and_gap():
     np.testing.assert_allclose(found.speed_factor, [1.0, share], rtol=1e-5)
     stretch = np.sqrt(1 - (20.0 / limit) ** 4)
     time_gap = (40.0 * stretch - prior.s0[0]) / 20.0
-    wanted = posterior(1.2, 0.25 * 1.2, time_gap, GAP_ERROR, 30)
-    np.testing.assert_allclose(found.T, [wanted, 1.2], rtol=1e-4)
+    T = float(prior.T[0])
+    wanted = posterior(T, 0.25 * T, time_gap, GAP_ERROR, 30)
+    np.testing.assert_allclose(found.T, [wanted, T], rtol=1e-4)
     # nothing is learned from a vehicle that brakes, changes lanes or stands
     for odd in ({"a": jnp.full(2, -1.0)}, {"side": jnp.ones(2, jnp.int32)}, {"v": jnp.zeros(2)}):
         same = see(nothing_seen(state), replace(state, **odd))

@@ -109,6 +109,7 @@ def build_conflicts(
         clear_s=clear_s,
         cross_s=cross_s,
         must_stop=must_stop,
+        approach=np.array([*(right_of_way.paths(k)[0].approach for k in range(len(lanes))), 0.0], np.float32),
         **floats,
         **ints,
     )

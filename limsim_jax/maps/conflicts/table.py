@@ -48,6 +48,7 @@ class ConflictTable:
     clear_s: Float[Array, " K"]  # m, end of the last crossing or merging stretch; 0 without any
     cross_s: Float[Array, " K"]  # m, end of the last crossing stretch, to be kept clear; 0 without any
     must_stop: Bool[Array, " K"]  # begins at a stop sign
+    approach: Float[Array, " K"]  # rad, heading of the traffic that comes to it
     foe: Int[Array, "K C"]  # connector
     s_in: Float[Array, "K C"]  # m, the stretch on the connector itself
     s_out: Float[Array, "K C"]

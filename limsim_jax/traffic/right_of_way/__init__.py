@@ -8,15 +8,17 @@ same state with the roles swapped:
 1. A vehicle inside the conflict area goes before one outside; one that can no longer stop before one
    that can.
 2. Otherwise a vehicle that stands where other paths cross goes first, then the one with priority: by the
-   light, by the map, between equals right before left, the longer waiting time, the earlier arrival.
-   A vehicle without priority may pass first if it finds a gap of `gap_lead` seconds. A vehicle that
-   stands and is delayed by others leaves a longer gap.
+   light, by the map, between equals the one in the junction, right before left, the longer waiting
+   time, the earlier arrival. At a four-way stop the first that has come goes first.
+   A vehicle without priority may pass first if it finds a gap of `gap_lead` seconds, longer before one
+   from the side and shorter in a merge. A vehicle that stands and is delayed by others leaves a longer gap.
 3. A vehicle that does not go first waits at the stop line, or lets the other clear the conflict area, or
    where paths merge follows the other as its leader.
 
 Gap acceptance follows the windows of entry and exit times of Krajzewicz & Erdmann, SUMO's junction model
 (2013), with the driver's `gap_factor`. Impatience shrinks gaps by up to 60 % within a minute of waiting.
-Highway Capacity Manual 6th ed., ch. 20: critical gaps of 4 to 7 s. The numbers are in `parameters`.
+The gaps give the capacities of the Highway Capacity Manual, 6th ed., ch. 20 to 22. The numbers are in
+`parameters`.
 """
 
 from limsim_jax.traffic.right_of_way.approaches import Approaches, approaches_ahead

@@ -7,9 +7,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from limsim_jax.maps.lane_map import NO_LANE, LaneMap
+from limsim_jax.maps.lane_map import NO_LANE, LaneMap, bend_speed
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.neighbors import Ahead
+from limsim_jax.traffic.parameters import JUNCTIONS
 from limsim_jax.types import Config, State
 
 
@@ -20,6 +21,7 @@ class Approaches(NamedTuple):
     lane: Int[Array, "N R"]
     x: Float[Array, "N R"]  # m, front bumper along the connector; negative before it
     line: Float[Array, "N R"]  # m to the place to wait before the junction; negative once passed
+    soonest: Float[Array, "N R"]  # s until the start of the connector, by what the lanes before it allow
 
 
 def approaches_ahead(config: Config, lane_map: LaneMap, state: State, ahead: Ahead) -> Approaches:
@@ -38,6 +40,7 @@ def approaches_ahead(config: Config, lane_map: LaneMap, state: State, ahead: Ahe
     junction = lane_map.junction[ahead.lane]
     setback = (lane_map.length - lane_map.stop_s)[ahead.lane]
     found, line = [], jnp.full_like(state.s, -NO_GAP)
+    soonest = _soonest(lane_map, state, ahead)
     inside = jnp.full_like(state.lane, -1)
     for r in range(lane_map.approaches):
         here = (connector >= 0) & (count == r + 1)
@@ -58,6 +61,26 @@ def approaches_ahead(config: Config, lane_map: LaneMap, state: State, ahead: Ahe
                 jnp.where(exists, pick(ahead.lane, index), NO_LANE),
                 jnp.where(exists, -start, -NO_GAP),
                 jnp.where(exists, line, -NO_GAP),
+                jnp.where(exists, pick(soonest, index), 0),
             )
         )
     return Approaches(*(jnp.stack(column, -1) for column in zip(*found, strict=True)))
+
+
+def _soonest(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, "N D"]:
+    """Least time (s) to the start of every lane ahead: limits and turns on the way there are kept to.
+
+    A vehicle that comes round a roundabout takes longer than its distance and its speed tell.
+    """
+    lane = ahead.lane[:, :-1]
+    limit = state.driver.speed_factor[:, None] * lane_map.speed_limit[lane]
+    turn = jnp.minimum(limit, bend_speed(lane_map, lane, state.driver.a_lat[:, None]) / JUNCTIONS.soonest)
+    # on its own lane it may be faster than that
+    limit = jnp.concatenate([jnp.maximum(limit[:, :1], state.v[:, None]), limit[:, 1:]], -1)
+    turn = jnp.concatenate([jnp.maximum(turn[:, :1], state.v[:, None]), turn[:, 1:]], -1)
+    way = ahead.start[:, 1:] - jnp.maximum(ahead.start[:, :-1], 0)
+    # a long connector bends in a part of it only
+    bend = jnp.where(lane_map.is_connector[lane], jnp.minimum(way, JUNCTIONS.turn_length), 0)
+    time = bend / jnp.maximum(turn, 1.0) + (way - bend) / jnp.maximum(limit, 1.0)
+    time = jnp.where(lane == NO_LANE, 0, time)
+    return jnp.concatenate([jnp.zeros_like(time[:, :1]), jnp.cumsum(time, -1)], -1)

@@ -6,12 +6,14 @@ vehicle comes to. These pairs, at most `PAIRS` per slot, are listed first and lo
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.conflicts import ConflictType
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.traffic.bodies import tails
@@ -22,10 +24,12 @@ from limsim_jax.traffic.right_of_way.approaches import Approaches
 from limsim_jax.traffic.right_of_way.passage import (
     Observed,
     Stretch,
-    accepted_gap,
+    arrival_time,
     compare,
+    gap_share,
     goes_first,
     travel_time,
+    usual_gap,
 )
 from limsim_jax.types import State
 from limsim_jax.xla import computed_once
@@ -35,6 +39,9 @@ PAIRS = 2
 
 FOES = 3
 """Vehicles that are looked at per conflict."""
+
+OPPOSING = math.radians(120)
+"""Vehicles whose headings differ by more come from opposite directions."""
 
 _BEHIND = 160.0  # m before a connector that still count as coming to it
 _UNKNOWN = 1e3  # s, arrival time of a vehicle blocked by a stopped one: effectively never
@@ -97,29 +104,32 @@ def meet(
     me, other, there, mine, theirs, level, splits, merges = foes
     vehicle, k, c = pairs.vehicle, pairs.connector, pairs.conflict
 
-    gaps = accepted_gap(driver, state)
+    shares = gap_share(driver, state)
+    turned = wrap_angle(table.approach[table.foe[k, c]] - table.approach[k])
+    gap = usual_gap(merges, (jnp.abs(turned) > OPPOSING)[None])
+    my_gap = shares[vehicle][None] * gap
+    foe_gap = shares[other.slot.astype(jnp.int32)] * gap
     encounter = compare(
-        me, mine, gaps[vehicle][None], other, theirs, gaps[other.slot.astype(jnp.int32)],
+        me, mine, my_gap, other, theirs, foe_gap,
         table.prio[k, c][None], table.tie[k, c][None], merges,
+        (table.must_stop[k] & table.must_stop[table.foe[k, c]])[None],
     )  # fmt: skip
 
     distance_in = mine.start - me.front
     past = mine.end + me.length - me.front <= 0
-    # a vehicle that clears the conflict area before one arrives needs no care
-    way = theirs.end + other.length - other.front
+    s0, T, b = (x[vehicle][None] for x in (driver.s0, driver.T, driver.b))
+    # a vehicle that clears the conflict area before one arrives needs no care; in a merge it has to be in
+    # front of one that is no faster
+    way = jnp.where(merges, theirs.start + s0, theirs.end) + other.length - other.front
     out = travel_time(
         way, jnp.minimum(other.v, other.turn_speed), other.turn_speed, JUNCTIONS.exit_acceleration * other.a
     )
-    arrival = travel_time(distance_in, me.v, me.top_speed, me.a)
+    arrival = arrival_time(me, mine.start)
     # it may stop inside the conflict area
     halts = (other.blocked > 0) | ((other.slowing > 0) & (other.line < -JUNCTIONS.margin))
-    clears = (out + JUNCTIONS.gap_follow < arrival) & ~merges
-    concerns = there & ~past & ~splits
-    cares = concerns & ~(clears & ~halts)
     # In a merge, follow the other where there is room behind it, and where that asks for less than to wait
     # before the conflict area, or before the junction if the vehicle could only just stop there.
     behind = (mine.end - me.front) - (theirs.end - other.front + other.length)
-    s0, T, b = (x[vehicle][None] for x in (driver.s0, driver.T, driver.b))
     reach = behind + other.v * other.v / (2 * b)
     hastes = (me.line > 0) & (me.line + JUNCTIONS.margin > me.brake)
     hastes &= me.line < me.brake * JUNCTIONS.firm_braking / JUNCTIONS.easy_braking
@@ -127,6 +137,9 @@ def meet(
         reach > jnp.where(hastes, me.line, distance_in)
     )
     follows = merges & (eases | (distance_in <= -JUNCTIONS.margin))
+    clears = (out + JUNCTIONS.gap_follow < arrival) & (~merges | ((me.v <= other.v) & ~follows))
+    concerns = there & ~past & ~splits
+    cares = concerns & ~(clears & ~halts)
     # keep clear: no vehicle enters behind a slow one only to stop where other paths cross
     clear = (table.cross_s[k][None] - me.front) + me.length + s0
     stands = (table.cross_s[k][None] > 0) & (me.line > -JUNCTIONS.margin)

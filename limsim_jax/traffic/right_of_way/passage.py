@@ -28,11 +28,12 @@ class Observed(NamedTuple):
     brake: Array  # m, to stop with `firm_braking`
     waiting: Array  # s
     line: Array  # m to the stop line
-    blocked: Array  # 1 if a light, a full exit or a queue stops it
+    blocked: Array  # 1 if a light, a sign, a full exit or a queue stops it
     yielding: Array  # 1 if it stood for the right of way at the last decision
     slowing: Array  # 1 if it brakes, and so may stop on its way
     light: Array  # 1 if the light gives priority, -1 if it takes it, 2 if it clears the junction
     slot: Array
+    soonest: Array  # s, least time to the start of the connector
 
 
 class Stretch(NamedTuple):
@@ -76,10 +77,32 @@ def travel_time(
     return jnp.maximum(reached - v, 0) / a + jnp.maximum(distance - room, 0) / v_end
 
 
-def accepted_gap(driver: Driver, state: State) -> Float[Array, " N"]:
-    """Gap (s) that a driver keeps to a vehicle with priority; impatience makes it smaller."""
+def arrival_time(vehicle: Observed, place: Array) -> Array:
+    """Least time (s) to a place (m along the connector)."""
+    free = travel_time(place - vehicle.front, vehicle.v, vehicle.top_speed, vehicle.a)
+    # from the start of the connector on at its full speed
+    slowed = vehicle.soonest + place / jnp.maximum(vehicle.top_speed, 0.1)
+    return jnp.where(vehicle.front < 0, jnp.maximum(free, slowed), free)
+
+
+def gap_share(driver: Driver, state: State) -> Float[Array, " N"]:
+    """Share of the usual gap that a driver keeps.
+
+    Impatience makes it smaller.
+    """
     impatience = jnp.clip((state.waiting - JUNCTIONS.impatience_start) / JUNCTIONS.impatience_time, 0, 1)
-    return JUNCTIONS.gap_lead * driver.gap_factor * (1 - JUNCTIONS.impatience * impatience)
+    return driver.gap_factor * (1 - JUNCTIONS.impatience * impatience)
+
+
+def usual_gap(merges: Array, opposing: Array) -> Array:
+    """Gap (s) that a usual driver keeps to a vehicle with priority.
+
+    Args:
+      merges: whether the paths merge; otherwise they cross.
+      opposing: whether the vehicles come from opposite directions; otherwise one comes from the side.
+    """
+    crossing = JUNCTIONS.gap_lead + jnp.where(opposing, 0, JUNCTIONS.gap_side)
+    return jnp.where(merges, JUNCTIONS.gap_merge, crossing)
 
 
 def compare(
@@ -92,19 +115,21 @@ def compare(
     prio: Array,
     tie: Array,
     merges: Array,
+    all_way: Array,
 ) -> Encounter:
     """What decides whether `me` goes before `foe`; with the roles swapped, the opposite.
 
     Args:
       me: one vehicle.
       mine: the conflict area on its connector.
-      my_gap: s, its `accepted_gap`.
+      my_gap: s, that it keeps.
       foe: the other vehicle.
       theirs: the conflict area on its connector.
-      foe_gap: s, its `accepted_gap`.
+      foe_gap: s, that it keeps.
       prio: priority by the map: 1 if `me` has it, -1 if `foe` has it, 0 if they are equal.
       tie: the same by right before left.
       merges: whether the paths merge; otherwise they cross.
+      all_way: whether both come from stop signs: the first that has come goes first.
     """
     margin = JUNCTIONS.margin
     my_distance, foe_distance = mine.start - me.front, theirs.start - foe.front
@@ -113,8 +138,8 @@ def compare(
     foe_level = (foe_distance <= -margin).astype(jnp.int32) + (foe_distance < foe.brake).astype(jnp.int32)
     my_arrival, foe_arrival = computed_once(
         (
-            travel_time(my_distance, me.v, me.top_speed, me.a),
-            travel_time(foe_distance, foe.v, foe.top_speed, foe.a),
+            arrival_time(me, mine.start),
+            arrival_time(foe, theirs.start),
         )
     )
     before = me.slot < foe.slot
@@ -129,7 +154,11 @@ def compare(
     first, sooner, my_level, foe_level = computed_once((first, sooner, my_level, foe_level))
     longer = jnp.where(me.waiting == foe.waiting, sooner, me.waiting > foe.waiting)
     both = jnp.minimum(me.waiting, foe.waiting)
-    equals = jnp.where((tie != 0) & (both < JUNCTIONS.tie_time), tie > 0, longer)
+    first_came = all_way & (jnp.abs(me.waiting - foe.waiting) > JUNCTIONS.turn_time)
+    equals = jnp.where((tie != 0) & (both < JUNCTIONS.tie_time) & ~first_came, tie > 0, longer)
+    # of equals, one that is in the junction before one at its line
+    my_entry, foe_entry = me.line < -margin, foe.line < -margin
+    equals = jnp.where(my_entry != foe_entry, my_entry, equals)
     light = jnp.sign(me.light - foe.light)
     order = jnp.where(light != 0, light, prio.astype(light.dtype))
     gridlock = (me.yielding > 0) & (foe.yielding > 0) & (both > JUNCTIONS.priority_time)

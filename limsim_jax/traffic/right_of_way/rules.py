@@ -81,11 +81,13 @@ def give_way(
         brake=everywhere(brake),
         waiting=everywhere(state.waiting),
         line=approaches.line,
-        blocked=everywhere((at_light < NO_GAP) | full | queued[:, None]),
+        # a vehicle that has yet to stop at a sign does not come before it has
+        blocked=everywhere((at_light < NO_GAP) | full | queued[:, None] | sign),
         yielding=everywhere(state.yielding),
         slowing=everywhere(state.a < -JUNCTIONS.slowing),
         light=light.astype(jnp.float32),
         slot=everywhere(jnp.arange(n)),
+        soonest=approaches.soonest,
     )
     if table.foe.shape[1]:
         until, lead, lead_gap = meet(lane_map, state, approaches, observed)

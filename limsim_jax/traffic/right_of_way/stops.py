@@ -87,7 +87,9 @@ def stop_signs(
     """Stop signs to obey, and vehicles that have obeyed the first."""
     sign = lane_map.conflicts.must_stop[approaches.connector] & (approaches.line > -JUNCTIONS.margin)
     first = jnp.where(sign, approaches.line, NO_GAP).min(-1)
-    stopped = (first < JUNCTIONS.sign_distance) & (state.stopped | (state.v < JUNCTIONS.sign_speed))
+    # egos are asked for what the law asks for
+    enough = jnp.full_like(state.v, JUNCTIONS.sign_speed).at[state.egos.slot].set(JUNCTIONS.sign_stop)
+    stopped = (first < JUNCTIONS.sign_distance) & (state.stopped | (state.v < enough))
     return sign & ~(stopped[:, None] & (approaches.line <= first[:, None])), stopped
 
 
