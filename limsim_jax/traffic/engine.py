@@ -144,7 +144,18 @@ def decide(
     blocked = obstructed(lane_map, state, own)
     if traffic.lane_changes:
         choice = choose_lane(
-            traffic.model, lane_map, state, v0, own, new, beside, beside_s, allowed, side, turn, blocked.there
+            traffic.model,
+            lane_map,
+            state,
+            v0,
+            own,
+            new,
+            beside,
+            beside_s,
+            allowed,
+            side,
+            turn,
+            blocked.behind,
         )
         choice = choice._replace(side=jnp.where(is_free(state) | blocked.stands, 0, choice.side))
     else:

@@ -18,10 +18,10 @@ from limsim_jax.xla import computed_once
 
 
 class Obstructed(NamedTuple):
-    """Vehicles that stand for good, and those behind one."""
+    """Vehicles that stand for good, and those behind one that may change lanes."""
 
     stands: Bool[Array, " N"]  # for good
-    there: Bool[Array, " N"]  # behind such a vehicle
+    behind: Bool[Array, " N"]  # such a vehicle, or the next in the queue
     stop: Float[Array, " N"]  # m to where it stops, to pull out from there; NO_GAP elsewhere
 
 
@@ -52,18 +52,19 @@ def obstructed(lane_map: LaneMap, state: State, own: Pair) -> Obstructed:
       own: neighbours on the own lane.
     """
     stands = computed_once(for_good(lane_map, state, own))
-    lead = own.lead
-    behind = (lead >= 0) & stands[lead] & ~stands & ~lane_map.is_connector[state.lane]
+    lead, lane = own.lead, state.lane
+    # on a single lane none can get past
+    passes = (lead >= 0) & ~stands & (lane_map.may_change_left[lane] | lane_map.may_change_right[lane])
+    first = passes & stands[lead] & ~lane_map.is_connector[lane]
     # the next in the queue does not follow a vehicle that pulls out to where it could not do so itself
-    second = (lead >= 0) & behind[lead] & ~stands & ~behind & (state.lane[lead] == state.lane)
+    second = passes & first[lead] & ~first & (lane[lead] == lane)
     room = own.lead_gap + jnp.where(second, state.shape.length[lead] + own.lead_gap[lead], 0)
     # the way of a lane change at walking pace
     way = creep_speed(state) * state.driver.lane_change_time + state.driver.s0
     braking = state.v * state.v / (2 * DRIVING.stand_braking)
     stop = jnp.maximum(room - way, jnp.minimum(room, braking)) + state.driver.s0
-    near = room < DRIVING.stand_sight
-    stop = jnp.where((behind | second) & near & (state.side == 0), stop, NO_GAP)
-    return Obstructed(stands, (behind | second) & near, stop)
+    behind = (first | second) & (room < DRIVING.stand_sight)
+    return Obstructed(stands, behind, jnp.where(behind & (state.side == 0), stop, NO_GAP))
 
 
 @jax.named_scope("beside_leaders")

@@ -575,7 +575,6 @@ def test_capacity_of_a_minor_stream_falls_with_the_major_flow_as_siegloch_has_it
     assert not collided.any() and (np.diff(found) < 0).all()
     follow_up = 3600 / found[0]
     assert 1.8 < follow_up < 3.0
-    print(follow_up, found)
     siegloch = lambda q, gap: 3600 / follow_up * np.exp(-q / 3600 * (gap - follow_up / 2))  # noqa: E731
     (gap,), _ = curve_fit(siegloch, q, found, p0=[5.0])
     assert 4.0 < gap < 7.0

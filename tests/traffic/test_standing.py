@@ -61,14 +61,12 @@ def test_a_queue_gets_past_a_vehicle_that_stands_for_good(run, crashed):
     state, lane = world(s, [20.0, 0.0, 0.0, 0.0, 0.0], crashed)
     end, (at, lanes, box, _) = run(state)
     at, lanes, box = (np.asarray(x).reshape(-1, *x.shape[2:]) for x in (at, lanes, box))
-    length = float(state.shape.length[0])
     gone = (at[-1, :-1] > PLACE + 50) | (lanes[-1, :-1] != lane) | ~np.asarray(end.active)[:-1]
     assert gone.all(), "within a minute"
     assert at[-1, -1] == PLACE and (lanes[:, -1] == lane).all(), "it stands where it stood"
     middle = np.hypot(*(box[:, :-1, :2] - box[:, -1:, :2]).transpose(2, 0, 1))
     assert middle.min() > 1.8, "none drives through it"
     assert not (np.asarray(end.status)[:-1] & int(Status.COLLIDED)).any()
-    assert length > 3
 
 
 def test_only_a_vehicle_without_a_reason_stands_for_good():
@@ -96,18 +94,18 @@ def test_only_a_vehicle_without_a_reason_stands_for_good():
 
 def test_vehicles_behind_one_that_stands_for_good_leave_room_to_pull_out():
     """Also the next in the queue, which would otherwise follow a vehicle that pulls out too far."""
-    state, lane = world([PLACE - 80.0, PLACE - 40.0, PLACE], [10.0, 8.0, 0.0], crashed=True)
+    state, _ = world([PLACE - 80.0, PLACE - 40.0, PLACE], [10.0, 8.0, 0.0], crashed=True)
     _, lane_map = bundled("highway")
     length = state.shape.length
     gap = jnp.array([40.0, 40.0, 1e6]) - jnp.array([length[1], length[2], 0])
     nothing = jnp.full(3, -1)
     found = obstructed(lane_map, state, Pair(jnp.array([1, 2, -1]), gap, nothing, jnp.full(3, 1e6)))
     np.testing.assert_array_equal(found.stands, [False, False, True])
-    np.testing.assert_array_equal(found.there, [True, True, False])
+    np.testing.assert_array_equal(found.behind, [True, True, False])
     way = np.maximum(LANE_CHANGES.least_way, LANE_CHANGES.long_way * np.asarray(length))
     room = np.array([80.0, 40.0]) - float(length[2])
     np.testing.assert_allclose(found.stop[:2], room - way[:2], rtol=1e-5)
-    assert float(found.stop[2]) > 1e5 and lane >= 0
+    assert float(found.stop[2]) > 1e5
 
 
 def test_a_vehicle_does_not_pull_out_just_in_front_of_one_that_rolls(run):
