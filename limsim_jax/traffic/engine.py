@@ -183,7 +183,7 @@ def decide(
         end - choice.stops_before, jnp.minimum(end, state.v * state.v / (2 * DRIVING.gentle_braking))
     )
     stop_obstacle = jnp.minimum(jnp.minimum(end, way.stop + state.driver.s0), blocked.stop)
-    own, second = pulling_out(lane_map, state, blocked.stands, own, second)
+    own, second = pulling_out(lane_map, state, blocked.stands, own, second, other, other_s)
     obstacles = Obstacles(
         jnp.stack([own.lead, second.lead, way.lead, jnp.full_like(own.lead, -1)], -1),
         jnp.stack([own.lead_gap, second.lead_gap, way.lead_gap, stop_obstacle], -1),

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.maps.lane_map import LaneMap, side_s, width
+from limsim_jax.maps.lane_map import LaneMap, width
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.motion import creep_speed
 from limsim_jax.traffic.neighbors import Pair
@@ -18,7 +18,7 @@ from limsim_jax.xla import computed_once
 
 
 class Obstructed(NamedTuple):
-    """Vehicles that stand for good, and those behind one that may change lanes."""
+    """Vehicles that stand for good, and those that can pass one."""
 
     stands: Bool[Array, " N"]  # for good
     behind: Bool[Array, " N"]  # such a vehicle, or the next in the queue
@@ -69,7 +69,13 @@ def obstructed(lane_map: LaneMap, state: State, own: Pair) -> Obstructed:
 
 @jax.named_scope("beside_leaders")
 def pulling_out(
-    lane_map: LaneMap, state: State, stands: Bool[Array, " N"], own: Pair, second: Pair
+    lane_map: LaneMap,
+    state: State,
+    stands: Bool[Array, " N"],
+    own: Pair,
+    second: Pair,
+    other: Int[Array, " N"],
+    other_s: Float[Array, " N"],
 ) -> tuple[Pair, Pair]:
     """Leaders of vehicles that change lanes.
 
@@ -82,11 +88,10 @@ def pulling_out(
       stands: for good.
       own: neighbours on the lane of the vehicle.
       second: on the other lane of a vehicle that changes lanes.
+      other: that lane, of `neighbors.other_lane`.
+      other_s: m along it.
     """
-    other = jnp.where(state.crossed, -state.side, state.side)
-    lane = jnp.where(other > 0, lane_map.left[state.lane], lane_map.right[state.lane])
-    between = width(lane_map, lane, side_s(lane_map, state.lane, state.s, other))
-    between = (width(lane_map, state.lane, state.s) + between) / 2
+    between = (width(lane_map, state.lane, state.s) + width(lane_map, other, other_s)) / 2
 
     def left_behind(pair: Pair, lane: Array, d: Array, leaves: Array) -> Pair:
         lead = pair.lead
@@ -97,8 +102,10 @@ def pulling_out(
         gap = pair.lead_gap + jnp.where(nearer, LANE_CHANGES.nearer * state.driver.s0, 0)
         return pair._replace(lead=jnp.where(clear, -1, lead), lead_gap=jnp.where(clear, NO_GAP, gap))
 
-    changes, side = state.side != 0, other.astype(between.dtype)
+    changes = state.side != 0
+    # a vehicle that has crossed came from the other side
+    d_other = state.d + state.side.astype(between.dtype) * between
     return (
         left_behind(own, state.lane, state.d, changes & ~state.crossed),
-        left_behind(second, lane, state.d - side * between, changes & state.crossed),
+        left_behind(second, other, d_other, changes & state.crossed),
     )

@@ -70,7 +70,7 @@ def seen(lane_map):
     return record
 
 
-SEEDS = (3, 0, 5)
+SEEDS = (1, 0, 5)
 
 
 @functools.cache
@@ -172,7 +172,7 @@ def measure() -> CountExposure:
 def test_counts_are_those_of_a_loop_over_the_trace(world, ego):
     steps, first = loop(world, ego)
     found = traced().measures
-    assert steps.sum() > 20 and (steps > 0).sum() >= (2 if ego < 2 else 1)  # the last one leaves early
+    assert steps.sum() > 20 and (steps > 0).sum() >= 2
     np.testing.assert_array_equal(found.steps[world, ego], steps)
     np.testing.assert_array_equal(found.first[world, ego], first)
 
