@@ -86,6 +86,54 @@ def test_the_ends_of_a_body_swing_out_at_a_kink_into_the_next_lane(turn, conflic
     assert (("a", "b") in entries(network([a, b, out]))) is conflicts
 
 
+def over_a_junction(at, *, junction=None, **fields):
+    """A connector of junction J, and a lane of 100 m, not joined to it, that it crosses `at` m along."""
+    a = straight("a", (0.0, 0.0), 0.0, 20.0, junction="J")
+    b = straight("b", (8.0, -at), math.pi / 2, 100.0, junction=junction, **fields)
+    return a, b
+
+
+@pytest.mark.parametrize(
+    ("at", "junction", "conflicts"),
+    [(20.0, None, True), (85.0, None, True), (50.0, None, False), (50.0, "K", True)],
+)
+def test_a_junction_that_lies_over_a_lane_of_another_place(at, junction, conflicts):
+    """The middle of a lane outside junctions does not count: it may be a bridge in a file without heights."""
+    found = entries(network(over_a_junction(at, junction=junction)))
+    assert bool(found) is conflicts
+    if conflicts:
+        entry = found["a", "b"][0]
+        got = [entry[name] for name in ("s_in", "s_out", "f_in", "f_out")]
+        np.testing.assert_allclose(got, [8 - REACH, 8 + REACH, at - REACH, at + REACH], atol=0.01)
+
+
+def test_lanes_that_follow_each_other_are_no_strangers():
+    """A lane that begins beside the next one, and the oncoming one."""
+    a = straight("a", (0.0, 0.0), 0.0, 20.0, junction="J", successors=("b",))
+    b = straight("b", (20.0, 0.0), 0.0, 30.0, road="r")
+    beside = straight("c", (20.0, 1.5), 0.0, 30.0, road="r")
+    oncoming = straight("d", (50.0, 1.5), math.pi, 30.0, road="r")
+    assert not entries(network([a, b, beside, oncoming]))
+
+
+@pytest.mark.parametrize(("leads", "prio"), [("out", -1), ("in", 1), ("elsewhere", -1)])
+def test_of_lanes_that_lie_over_each_other_the_one_on_the_way_out_goes_first(leads, prio):
+    """Seen from a connector of J: a lane that comes from J goes before it, one that leads there after it.
+
+    Where neither holds, the one from the right goes first.
+    """
+    a, b = over_a_junction(50.0, junction="K", successors=("on",) if leads == "in" else ())
+    on = straight("on", (8.0, 50.0), math.pi / 2, 5.0, successors=("c",))
+    c = straight("c", (8.0, 55.0), math.pi / 2, 10.0, junction="J")
+    if leads == "out":
+        b = straight("b", (8.0, 50.0), -math.pi / 2, 100.0, junction="K")  # from the left
+        on = straight("on", (8.0, 55.0), -math.pi / 2, 5.0, successors=("b",))
+        c = straight("c", (8.0, 65.0), -math.pi / 2, 10.0, junction="J", successors=("on",))
+    if leads == "elsewhere":
+        on = straight("on", (8.0, 50.0), math.pi / 2, 50.0)
+    assert only(network([a, b, on, c]), "a", "b")["prio"] == prio
+
+
 def test_bridges_do_not_conflict():
     assert not entries(crossing(math.pi / 2, z=3.6))
     assert entries(crossing(math.pi / 2, z=3.4))

@@ -29,21 +29,23 @@ def build_conflicts(
 ) -> ConflictTable:
     """Find all conflicts of a network and their right of way.
 
-    The comparison covers lanes of the same junction (of one road only those side by side), and lanes
-    anywhere that share a successor or a predecessor. Outside junctions the 200 m next to the shared
-    lane count. Lanes more than 3.5 m apart in elevation pass over each other.
+    The comparison covers lanes of the same junction (of one road only those side by side), lanes
+    anywhere that share a successor or a predecessor, and lanes that lie over each other without being of
+    one junction (`strangers`). Outside junctions the 200 m next to the shared lane count. Lanes more than
+    3.5 m apart in elevation pass over each other.
 
     Diverging paths need no priority, and paths that sweep are equal. For the others the first rule that
     distinguishes them decides:
 
-    1. the file (`Movement.yields_to`); two movements that yield to each other are equal;
-    2. control: priority before none or signal before yield, stop and all-way stop; zipper is equal;
-    3. roundabouts: lanes that leave the ring or stay on it before lanes that enter. A ring is a
+    1. where a lane lies over one of another junction: on the way out of that before inside before into it;
+    2. the file (`Movement.yields_to`); two movements that yield to each other are equal;
+    3. control: priority before none or signal before yield, stop and all-way stop; zipper is equal;
+    4. roundabouts: lanes that leave the ring or stay on it before lanes that enter. A ring is a
        closed path of at most 600 m that turns evenly once round;
-    4. merging lanes: through lanes before entry, ramp and slip lanes;
-    5. turns: straight before turning, U-turns last; of opposing turns the one to the near side first;
-    6. lanes that merge at less than 45 degrees: the road with more lanes, then the faster one first;
-    7. right before left (left before right with left-hand traffic) between 30 and 165 degrees.
+    5. merging lanes: through lanes before entry, ramp and slip lanes;
+    6. turns: straight before turning, U-turns last; of opposing turns the one to the near side first;
+    7. lanes that merge at less than 45 degrees: the road with more lanes, then the faster one first;
+    8. right before left (left before right with left-hand traffic) between 30 and 165 degrees.
 
     Signals set no priority: the rules hold between movements that are green together, and for all
     when the lights are off.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -18,6 +18,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.spatial.distance import cdist
+from shapely import LineString, STRtree
 
 from limsim_jax.maps.conflicts.table import ConflictType
 from limsim_jax.maps.network import Lane, Network
@@ -33,12 +34,16 @@ LONGEST = 12.0
 SHARPEST = 1.9
 """Turn (rad) within `_BEND` above which a body swings round on the spot: a U-turn of 2.6 m radius."""
 
+TOUCHING = 1.7
+"""Distance (m) of centre lines below which cars of 1.8 m touch, for lanes that no junction joins."""
+
 _SWING = 1.8  # m, by which the corners of a car stand out more when it turns on the spot than along its way
 _KINK = 1.2  # rad, turn within `_SPOT`, also into the next lane, above which the ends of a body swing out ...
 _SPOT = 1.0  # m
 _KINK_SWING = 1.0  # m: ... as far as this
 _STEP = 0.25  # m, sampling of the centre lines
 _REACH = 200.0  # m, from a merge or split outside junctions, on which two lanes are compared
+_FRINGE = 25.0  # m at both ends of a lane outside junctions that may belong to a junction
 _STEP_ASIDE = 8.0  # m at the end of a lane that jumps aside to another one
 _BEND = 5.0  # m, over which curvature is averaged for sweeps: the length of a car
 _TOUCH = 0.05  # m, a stretch that starts or ends this close to an end of its lane reaches it
@@ -76,8 +81,8 @@ class Overlap:
 def connectors(network: Network) -> list[Lane]:
     """Lanes that have a row in the conflict table, in file order.
 
-    The drivable lanes inside junctions, and those outside that share a successor or a predecessor
-    with another drivable lane.
+    The drivable lanes inside junctions, those outside that share a successor or a predecessor
+    with another drivable lane, and those over which a junction lies that is not theirs (`strangers`).
     """
     lanes = {lane.id: lane for lane in network.drivable_lanes()}
     shared = {
@@ -85,7 +90,60 @@ def connectors(network: Network) -> list[Lane]:
         for siblings in (*sharing(lanes, "successors").values(), *sharing(lanes, "predecessors").values())
         for lane in siblings
     }
+    shared |= {name for pair in strangers(lanes.values()) for name in pair}
     return [lane for lane in lanes.values() if lane.junction is not None or lane.id in shared]
+
+
+def strangers(lanes: Iterable[Lane], reach: float = TOUCHING) -> set[tuple[str, str]]:
+    """Lanes that lie over each other without being of one junction.
+
+    Junctions that are too near to each other, or drawn too wide, lie over lanes of others. Of a lane outside
+    junctions only the `_FRINGE` at both ends counts: a road may cross a junction on a bridge, and many files
+    give no height.
+
+    Args:
+        lanes: All lanes of a network.
+        reach: Distance (m) of centre lines below which vehicles touch.
+
+    Returns:
+        Ids of both, each pair once. Lanes of roads that follow each other, or of the same junction or
+        road, are no strangers.
+    """
+    by_id = {lane.id: lane for lane in lanes if lane.drivable}
+    every = list(by_id.values())
+    if not every:
+        return set()
+    lines = [LineString(lane.xyz[:, :2]) for lane in every]
+    near = STRtree(lines).query(lines, "dwithin", reach)
+    joined: dict[tuple[str, int, bool], set[tuple[str, int, bool]]] = defaultdict(set)  # carriageways
+    for lane in every:
+        for other in _followers(lane, by_id, 2 * reach):  # a path that bends comes closer than its length
+            after = by_id[other].carriageway
+            joined[lane.carriageway].add(after)
+            joined[after].add(lane.carriageway)
+    found: set[tuple[str, str]] = set()
+    for a, b in near.T[near[0] < near[1]].tolist():
+        one, two = every[a], every[b]
+        if one.road == two.road or (one.junction is not None and one.junction == two.junction):
+            continue
+        if two.carriageway not in joined[one.carriageway] and _touch(one, two, reach):
+            found.add((one.id, two.id))
+    return found
+
+
+def _touch(one: Lane, two: Lane, reach: float) -> bool:
+    """Whether parts that count come closer than `reach` (m)."""
+    p, q = (_part(lane) for lane in (one, two))
+    close = cdist(p[:, :2], q[:, :2]) < reach
+    return bool((close & (np.abs(p[:, None, 2] - q[None, :, 2]) <= CLEARANCE)).any())
+
+
+def _part(lane: Lane) -> Floats:
+    """Points of a lane that count, `[samples, 3]`."""
+    s = np.linspace(0, lane.length, max(2, math.ceil(lane.length / _STEP) + 1))
+    if lane.junction is None:
+        s = s[(s < _FRINGE) | (s > lane.length - _FRINGE)]
+    return lane.pose(s)[0]
 
 
 def find_overlaps(
@@ -108,8 +166,9 @@ def find_overlaps(
     curves, reach = _Curves(lanes), width + margin
     regions = []
     around = {lane.id: lane for lane in lanes} if network is None else network
+    strange = strangers(around.values())
     swing = [_swing(curves, a, lanes[k], around) for a, k in enumerate(curves.owner)]
-    for a, b in _candidates(lanes, curves, reach + max(swing, default=0.0)):
+    for a, b in _candidates(lanes, curves, reach + max(swing, default=0.0), strange):
         regions.extend(curves.regions(a, b, reach + max(swing[a], swing[b])))
     stretches = curves.refine(regions)
     overlaps = [
@@ -125,7 +184,7 @@ def find_overlaps(
         for region, s in zip(regions, stretches.tolist(), strict=True)
     ]
     found = _classify(lanes, overlaps)
-    return [*found, *_merges_with_a_jump(lanes, found), *_sweeps(lanes, curves, overlaps, width)]
+    return [*found, *_merges_with_a_jump(lanes, found), *_sweeps(lanes, curves, overlaps, width, strange)]
 
 
 def _swing(curves: _Curves, a: int, lane: Lane, network: Mapping[str, Lane]) -> float:
@@ -164,7 +223,11 @@ def _merges_with_a_jump(lanes: Sequence[Lane], overlaps: Sequence[Overlap]) -> I
 
 
 def _sweeps(
-    lanes: Sequence[Lane], curves: _Curves, overlaps: Sequence[Overlap], width: float
+    lanes: Sequence[Lane],
+    curves: _Curves,
+    overlaps: Sequence[Overlap],
+    width: float,
+    strange: Collection[tuple[str, str]],
 ) -> Iterator[Overlap]:
     """Stretches on which only the ends of long bodies meet.
 
@@ -174,7 +237,7 @@ def _sweeps(
     """
     known = {(o.first, o.second) for o in overlaps}
     most = math.pi / 8 * LONGEST  # m, two bodies together, each in a turn of 90 degrees
-    for a, b in _candidates(lanes, curves, width + most):
+    for a, b in _candidates(lanes, curves, width + most, strange):
         first, second = curves.owner[a], curves.owner[b]
         if (first, second) in known:
             continue
@@ -379,7 +442,9 @@ def _distance_to_curve(
     return best
 
 
-def _candidates(lanes: Sequence[Lane], curves: _Curves, reach: float) -> list[tuple[int, int]]:
+def _candidates(
+    lanes: Sequence[Lane], curves: _Curves, reach: float, strange: Collection[tuple[str, str]]
+) -> list[tuple[int, int]]:
     """Pairs of curves that can conflict, first < second."""
     index = {lane.id: k for k, lane in enumerate(lanes)}
     by_id = {lane.id: lane for lane in lanes}
@@ -404,6 +469,10 @@ def _candidates(lanes: Sequence[Lane], curves: _Curves, reach: float) -> list[tu
         for siblings in sharing(by_id, links).values():
             for one, two in itertools.combinations(siblings, 2):
                 add(index[one.id], index[two.id], curve)
+    for one, two in strange:
+        if one in index and two in index:
+            for curve in (curves.head, curves.tail):
+                add(index[one], index[two], curve)
     found = np.array(sorted(pairs), int).reshape(-1, 2)
     meet = curves.boxes_meet(found[:, 0], found[:, 1], reach)
     return [(int(a), int(b)) for a, b in found[meet]]

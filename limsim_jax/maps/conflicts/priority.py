@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 class Rule(enum.IntEnum):
     """Rules of right of way, the weakest first.
 
-    Cycles are broken in this order, up to `ROUNDABOUT`.
+    Cycles are broken in this order, up to `WAY_OUT`.
     """
 
     NONE = 0
@@ -34,8 +34,9 @@ class Rule(enum.IntEnum):
     TURN = 3
     RAMP = 4
     ROUNDABOUT = 5
-    CONTROL = 6
-    FILE = 7
+    WAY_OUT = 6
+    CONTROL = 7
+    FILE = 8
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ _CONTROL_RANK = {
 _RAMPS = frozenset(
     {LaneType.ENTRY, LaneType.ON_RAMP, LaneType.CONNECTING_RAMP, LaneType.SLIP_LANE, LaneType.OFF_RAMP}
 )
+_NEAR = 30.0  # m from a junction, within which lanes lead into it or out of it
 _LEFT, _RIGHT = (Turn.LEFT, Turn.SLIGHT_LEFT), (Turn.RIGHT, Turn.SLIGHT_RIGHT)
 
 
@@ -143,12 +145,36 @@ class RightOfWay:
         if overlap.type is ConflictType.DIVERGE:
             return Decision(0, Rule.NONE, 0)
         i, j = overlap.first, overlap.second
+        out = self._way_out(self.lanes[i], self.lanes[j]) - self._way_out(self.lanes[j], self.lanes[i])
+        if out:
+            return Decision(_sign(out), Rule.WAY_OUT, 0)
         found = [
             self._between(one, two, overlap) for one, two in itertools.product(self.paths(i), self.paths(j))
         ]
         strongest = max(decision.rule for decision in found)
         found = [decision for decision in found if decision.rule is strongest]
         return Decision(_sign(sum(d.prio for d in found)), strongest, _sign(sum(d.tie for d in found)))
+
+    def _way_out(self, lane: Lane, other: Lane) -> int:
+        """1 on the way out of that junction, -1 into it."""
+        if other.junction is None or lane.junction == other.junction:
+            return 0
+        if set(lane.successors) & set(other.successors) or set(lane.predecessors) & set(other.predecessors):
+            return 0  # they merge or part
+        comes, leads = (self._meets(lane, links, other.junction) for links in ("predecessors", "successors"))
+        return comes - leads
+
+    def _meets(self, lane: Lane, links: str, junction: str) -> bool:
+        """Whether links lead to a junction within `_NEAR`."""
+        lanes, todo, seen = self.network.lanes, [(name, 0.0) for name in getattr(lane, links)], set[str]()
+        while todo:
+            name, way = todo.pop()
+            if name in lanes and name not in seen and way < _NEAR:
+                seen.add(name)
+                if lanes[name].junction == junction:
+                    return True
+                todo.extend((after, way + lanes[name].length) for after in getattr(lanes[name], links))
+        return False
 
     def _between(self, one: Path, two: Path, overlap: Overlap) -> Decision:
         turned = math.remainder(two.approach - one.approach, 2 * math.pi)  # > 0: two comes from the right
@@ -288,7 +314,7 @@ def without_cycles(
     """
     prio = prio.copy()
     size = int(ends.max(initial=0)) + 1
-    for weakest in (Rule.SIDE, Rule.ROAD, Rule.TURN, Rule.RAMP, Rule.ROUNDABOUT):
+    for weakest in (Rule.SIDE, Rule.ROAD, Rule.TURN, Rule.RAMP, Rule.ROUNDABOUT, Rule.WAY_OUT):
         yields = np.where(prio[:, None] < 0, ends, ends[:, ::-1])[prio != 0]
         group = connected_components(_graph(yields[:, 0], yields[:, 1], size), connection="strong")[1]
         prio[(rule == weakest) & (group[ends[:, 0]] == group[ends[:, 1]])] = 0
