@@ -43,6 +43,12 @@ GREEN = 25.0
 GREEN_TURN = 10.0
 """Green time (s) of a generated stage of turns only."""
 
+LONGEST_CYCLE = 120.0
+"""Longest cycle (s) of a generated program, RiLSA (2015)."""
+
+LEAST_GREEN = 7.0
+"""Least green time (s) where the cycle would take longer."""
+
 REACTION = 1.0
 """Perception and reaction time (s) in the yellow time."""
 
@@ -217,6 +223,7 @@ def generate_programs(network: Network, *, green: float = GREEN, green_turn: flo
       the next one is then yellow (`yellow_time` at the fastest approach) and red (`all_red_time` over the
       longest way to the end of the last conflict, at the speed limit or that of the turn).
     - Green is major where no other green movement goes first, otherwise minor.
+    - Where the cycle would take more than `LONGEST_CYCLE`, green is shorter, but `LEAST_GREEN` at least.
     - A junction with a single stage alternates with 10 s of red.
 
     Notes: one `added` per program, one `ignored` per light that governs no movement.
@@ -259,6 +266,21 @@ def generate_programs(network: Network, *, green: float = GREEN, green_turn: flo
                 "signal program", f"signal {light.id}", "governs no movement of a junction", light.line
             )
     return dataclasses.replace(network, programs=programs, movements=tuple(movements), report=report)
+
+
+def _in_one_cycle(phases: Sequence[Phase]) -> tuple[Phase, ...]:
+    """The phases, green cut in proportion to keep `LONGEST_CYCLE`."""
+    cycle = sum(phase.duration for phase in phases)
+    green = sum(phase.duration for phase in phases if phase.name.endswith("green"))
+    if cycle <= LONGEST_CYCLE or not green:
+        return tuple(phases)
+    share = max(LONGEST_CYCLE - (cycle - green), 0.0) / green
+
+    def cut(phase: Phase) -> Phase:
+        least = min(LEAST_GREEN, phase.duration)
+        return dataclasses.replace(phase, duration=max(math.floor(share * phase.duration), least))
+
+    return tuple(cut(phase) if phase.name.endswith("green") else phase for phase in phases)
 
 
 def _lights_of(movement: Movement, lights: Mapping[str, Sequence[TrafficLight]]) -> list[TrafficLight]:
@@ -440,7 +462,7 @@ class _Planner:
         return Program(
             id=name,
             name=f"generated for junction {members[0].junction}",
-            phases=tuple(phases),
+            phases=_in_one_cycle(phases),
             movements=tuple((m.index,) for m in members),
             generated=True,
         )

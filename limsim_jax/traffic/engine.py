@@ -284,9 +284,14 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
     # a part of a short lane: no vehicle waits before it, on a lane that it would block
     creep = creep_speed(state) * state.driver.lane_change_time + state.driver.s0
     clear = (jnp.maximum(DRIVING.end_clear, creep) - DRIVING.end_gap)[:, None]
-    count = jnp.maximum(jnp.abs(lane_map.routes.lanes_to_go[ahead.lane, goal]), 1).astype(clear.dtype)
-    part = ahead.start + lane_map.length[ahead.lane] / (count + 1)
-    room = jnp.minimum(jnp.maximum(wide - count * clear, part), wide)
+    to_go = lane_map.routes.lanes_to_go[ahead.lane, goal]
+    count = jnp.maximum(jnp.abs(to_go), 1).astype(clear.dtype)
+    part = lane_map.length[ahead.lane] / (count + 1)
+    # a vehicle waits where the lane beside has opened, or it could never change
+    opens = lane_map.start_s[jnp.where(to_go > 0, lane_map.left[ahead.lane], lane_map.right[ahead.lane])]
+    opened = jnp.where(opens > 0, opens + (state.shape.length + state.driver.s0)[:, None], 0)
+    room = jnp.maximum(wide - count * clear, ahead.start + jnp.maximum(part, opened))
+    room = jnp.minimum(room, wide)
     # a vehicle that comes too fast for that place stops as soon as it can; one between lanes drives on
     wait = jnp.where((state.side != 0)[:, None], wide, jnp.minimum(jnp.maximum(room, stopping), wide))
     leaves = (state.side != 0) & ~state.crossed

@@ -23,9 +23,16 @@ from synthetic import (
 )
 
 from limsim_jax.maps import read_network
-from limsim_jax.maps.conflicts import ConflictType, build_conflicts, connectors, priority_cycles
+from limsim_jax.maps.conflicts import (
+    ConflictType,
+    Overlap,
+    build_conflicts,
+    connectors,
+    priority_cycles,
+)
 from limsim_jax.maps.conflicts.build import MARGIN, VEHICLE_WIDTH
 from limsim_jax.maps.conflicts.table import ABSENT
+from limsim_jax.maps.conflicts.waiting import hold_back
 from limsim_jax.maps.network import Control, LaneType, Turn
 
 REACH = VEHICLE_WIDTH + MARGIN
@@ -132,6 +139,30 @@ def test_of_lanes_that_lie_over_each_other_the_one_on_the_way_out_goes_first(lea
     if leads == "elsewhere":
         on = straight("on", (8.0, 50.0), math.pi / 2, 50.0)
     assert only(network([a, b, on, c]), "a", "b")["prio"] == prio
+
+
+@pytest.mark.parametrize(
+    ("place", "across", "hold"),
+    [
+        (20.0, [], 20.0),
+        (20.0, [(20.0, 24.0)], 20.0),  # the one that it waits for
+        (20.0, [(10.0, 14.9)], 20.0),  # room for a car between two paths
+        (20.0, [(10.0, 15.1)], 10.0),
+        (20.0, [(10.0, 16.0), (3.0, 6.0)], 3.0),  # and there it would be in the way of a third
+        (20.0, [(10.0, 16.0), (1.0, 4.0)], 10.0),
+    ],
+)
+def test_where_a_car_waits_inside_a_junction_it_is_in_the_way_of_no_path_with_priority(place, across, hold):
+    def row(prio, kind):
+        return [(overlap(begin, end, kind), prio, 0) for begin, end in across]
+
+    assert hold_back(place, row(-1, ConflictType.CROSS)) == hold
+    for prio, kind in ((1, ConflictType.CROSS), (0, ConflictType.CROSS), (-1, ConflictType.MERGE)):
+        assert hold_back(place, row(prio, kind)) == place
+
+
+def overlap(begin, end, kind):
+    return Overlap(first=0, second=1, s_in=begin, s_out=end, f_in=0.0, f_out=1.0, type=kind)
 
 
 def test_bridges_do_not_conflict():

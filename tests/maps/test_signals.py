@@ -28,6 +28,7 @@ from limsim_jax.maps.network import (
 )
 from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.maps.signals import (
+    LONGEST_CYCLE,
     all_red_time,
     build_signals,
     generate_programs,
@@ -290,6 +291,14 @@ def test_crossing_with_shared_lanes_has_two_stages(over):
     assert "junction J" in note.where and "2 stages" in note.message
     table = build_signals(net, rows(net))
     assert table.state.shape == (2, 6, 12)
+
+
+@pytest.mark.parametrize(("green", "least"), [(25.0, 25.0), (60.0, 40.0), (500.0, 40.0)])
+def test_no_generated_cycle_is_longer_than_two_minutes(green, least):
+    net = generate_programs(lit(intersection()), green=green)
+    phases = net.programs["J"].phases
+    assert sum(phase.duration for phase in phases) <= LONGEST_CYCLE
+    assert min(phase.duration for phase in phases if phase.name.endswith("green")) >= least
 
 
 def test_the_given_network_is_left_alone():

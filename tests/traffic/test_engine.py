@@ -366,3 +366,26 @@ def test_a_vehicle_before_a_short_wrong_lane_takes_another_goal():
     np.testing.assert_array_equal(after.goal, gives_up)
     np.testing.assert_array_equal((after.status & int(Status.MISSED_ROUTE)) > 0, gives_up)
     np.testing.assert_array_equal(after.side, [0, 0, 0, 0, 0, 1])
+
+
+@pytest.mark.parametrize("opens", [0.0, 16.0, 20.0])
+def test_a_vehicle_reaches_a_lane_that_opens_late(opens):
+    """The lane on the left, which alone leads on, is wide enough after `opens` m of 34 m."""
+    map_ = network([
+        straight("a", (0.0, 0.0), 0.0, 100.0, successors=("right",)),
+        straight("right", (100.0, 0.0), 0.0, 34.0, road="p", left="left", may_change_left=True),
+        straight("left", (100.0, 3.5), 0.0, 34.0, road="p", number=1, successors=("out",), right="right"),
+        straight("out", (134.0, 3.5), 0.0, 400.0),
+    ])  # fmt: skip
+    rows, lane_map = lane_rows(map_), build_lane_map(map_, goals=[["out"]])
+    lane_map = dataclasses.replace(
+        lane_map, start_s=jnp.asarray(lane_map.start_s).at[rows["left"]].set(opens)
+    )
+    state = state_of("ramp", [rows["a"]], [60.0], [8.0], [0])
+
+    def decision(state, _):
+        return drive(CONFIG, Traffic(), lane_map, state)[0], None
+
+    end, _ = jax.jit(lambda x: jax.lax.scan(decision, x, None, length=38))(state)
+    assert int(end.lane[0]) in (rows["left"], rows["out"])
+    assert not int(end.status[0])

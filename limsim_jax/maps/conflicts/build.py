@@ -9,7 +9,7 @@ import numpy as np
 from limsim_jax.maps.conflicts.overlaps import Overlap, connectors, find_overlaps
 from limsim_jax.maps.conflicts.priority import Decision, RightOfWay, Rule, movement_groups, without_cycles
 from limsim_jax.maps.conflicts.table import ABSENT, ConflictTable, ConflictType
-from limsim_jax.maps.conflicts.waiting import waiting_points
+from limsim_jax.maps.conflicts.waiting import hold_back, waiting_points
 from limsim_jax.maps.network import Control, Network
 
 VEHICLE_WIDTH = 2.0
@@ -79,7 +79,8 @@ def build_conflicts(
         entries[overlap.first].append((overlap, p, t))
         entries[overlap.second].append((overlap.mirrored(), -p, -t))
     num, slots = len(lanes) + 1, max([0, *map(len, entries)])
-    floats = {name: np.full((num, slots), ABSENT, np.float32) for name in ("s_in", "s_out", "f_in", "f_out")}
+    stretches = "s_in", "s_out", "f_in", "f_out"
+    floats = {name: np.full((num, slots), ABSENT, np.float32) for name in (*stretches, "hold")}
     floats |= {name: np.zeros((num, slots), np.float32) for name in ("sweep", "f_sweep")}
     ints = {name: np.zeros((num, slots), np.int32) for name in ("foe", "type", "prio", "tie")}
     ints["foe"][:] = -1
@@ -91,8 +92,9 @@ def build_conflicts(
     for k, row in enumerate(entries):
         row.sort(key=lambda entry: (entry[0].s_in, entry[0].s_out, entry[0].second))
         for c, (overlap, p, t) in enumerate(row):
-            for name in floats:
+            for name in (*stretches, "sweep", "f_sweep"):
                 floats[name][k, c] = getattr(overlap, name)
+            floats["hold"][k, c] = hold_back(overlap.s_in, row)
             ints["foe"][k, c], ints["type"][k, c] = overlap.second, overlap.type
             ints["prio"][k, c], ints["tie"][k, c] = p, t
         met = [o.s_out for o, _, _ in row if o.type in (ConflictType.CROSS, ConflictType.MERGE)]

@@ -54,6 +54,7 @@ class ConflictTable:
     s_out: Float[Array, "K C"]
     f_in: Float[Array, "K C"]  # m, the stretch on the foe
     f_out: Float[Array, "K C"]
+    hold: Float[Array, "K C"]  # m, where to wait for the foe without a body in the way of one with priority
     type: Int[Array, "K C"]  # ConflictType
     prio: Int[Array, "K C"]  # +1 goes before the foe, 0 equal, -1 yields
     tie: Int[Array, "K C"]  # the same between equals that arrive together (right before left), or 0
@@ -77,7 +78,7 @@ class ConflictTable:
             return out
 
         fills = {"foe": -1, "lane": -1, "connector": -1, "movement": -1, "length": 1.0}
-        fills |= dict.fromkeys(("s_in", "s_out", "f_in", "f_out"), ABSENT)
+        fills |= dict.fromkeys(("s_in", "s_out", "f_in", "f_out", "hold"), ABSENT)
         return ConflictTable(
             **{
                 name: null_last(x, lanes if name == "connector" else connectors, fills.get(name, 0))

@@ -9,7 +9,11 @@ import numpy as np
 
 from limsim_jax.maps.conflicts.overlaps import Overlap
 from limsim_jax.maps.conflicts.priority import RightOfWay
+from limsim_jax.maps.conflicts.table import ConflictType
 from limsim_jax.maps.network import Lane, Movement, Network
+
+CAR = 5.0
+"""Length (m) of a car that waits inside a junction."""
 
 
 def waiting_points(
@@ -51,6 +55,24 @@ def waiting_points(
                 if point > offset:
                     waiting[k] = float(point - offset)
     return waiting
+
+
+def hold_back(place: float, row: Sequence[tuple[Overlap, int, int]]) -> float:
+    """Where to wait before a place, out of the way of others.
+
+    The last place (m) before it at which a car lies across no path that has priority over its own. Cars that
+    wait in each other's way inside a junction would hold one another for good.
+
+    Args:
+        place: m along the connector.
+        row: the conflicts of the connector, with their priority.
+    """
+    across = [(o.s_in, o.s_out) for o, prio, _ in row if prio < 0 and o.type is ConflictType.CROSS]
+    while True:
+        lower = min((begin for begin, end in across if begin < place and end > place - CAR), default=place)
+        if lower == place:
+            return place
+        place = lower
 
 
 def _opposed(movement: Movement, k: int, foes: Iterable[tuple[float, int]], right_of_way: RightOfWay) -> bool:

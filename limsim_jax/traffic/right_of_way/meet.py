@@ -169,7 +169,9 @@ def meet(
     follows &= waits
     waits, follows = computed_once((waits, follows))
     taken = (waits & ~follows).any(0)
-    until = jnp.where(taken, distance_in[0], NO_GAP)
+    # before a path with priority rather than across it, if it can still stop there
+    back = table.hold[k, c] - me.front[0]
+    until = jnp.where(taken, jnp.where(back > me.brake[0], back, distance_in[0]), NO_GAP)
     count = approaches.connector.shape[1]
     until = jnp.full(n * count, NO_GAP, jnp.float32).at[pairs.row].min(until)
     until = jnp.where(pairs.missed, jnp.minimum(until, 0), until).reshape(n, count)
