@@ -565,7 +565,7 @@ def build(
     from limsim_jax.sweeps.episode import Episodes
     from limsim_jax.xla import use_all_cores
 
-    use_all_cores(cores)
+    use_all_cores(cores, spare=any(one.asks_host for one in experiments))
     return [Episodes(one, chunk=chunk) for one in experiments]
 
 

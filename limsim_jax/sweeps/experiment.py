@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -207,6 +207,23 @@ class ExperimentFile(Table):
         return all(
             getattr(ego, name) == getattr(self.ego[0], name) for ego in self.ego[1:] for name in _OF_POLICY
         )
+
+    @property
+    def asks_host(self) -> bool:
+        """Whether worlds may call functions outside JAX while they run.
+
+        Policies of one's own may, and `language`; so does a demand of SUMO."""
+        named = [word for ego in self.ego for word in _words([ego.policy, ego.options])]
+        return bool(self.traffic.demand) or any(":" in word or word == "language" for word in named)
+
+
+def _words(tree: Any) -> Iterator[str]:
+    """All texts of a tree of plain values; of what is not plain, ":"."""
+    if isinstance(tree, Mapping | list | tuple):
+        for x in tree.values() if isinstance(tree, Mapping) else tree:
+            yield from _words(x)
+    elif not isinstance(tree, bool | int | float | None):
+        yield tree if isinstance(tree, str) else ":"
 
 
 def bundled_experiments() -> dict[str, Path]:
