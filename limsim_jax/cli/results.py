@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -239,6 +240,8 @@ def sweep(
         made = [_sumo_episodes(experiment, policy, ego, egos, horizon, drivers, chunk)]
     else:
         made = build(experiments, chunk) if workers is None else []
+    if html and part is None:  # imported while programs are loaded or compiled
+        Thread(target=_import_report, daemon=True).start()
     try:
         with progress_bar() as show:
 
@@ -705,6 +708,12 @@ def _print_table(table: TextTable) -> None:
     console.print(shown)
     for note in table.notes:
         print(note)
+
+
+def _import_report() -> None:
+    from limsim_jax.report.page import get_ready
+
+    get_ready()
 
 
 def _write_report(

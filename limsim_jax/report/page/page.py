@@ -16,10 +16,13 @@ The text stands in `page.html.j2`, which escapes every value.
 from __future__ import annotations
 
 import base64
+import importlib
 import json
+import os
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -70,6 +73,12 @@ if TYPE_CHECKING:
 Replayer = Callable[[str, str, Sequence[int]], Sequence[tuple[Any, ...]]]
 """(scenario, policy, seed) -> (network, lane_map, trace, slot of the ego, moments, ...)."""
 
+PARTS = (
+    "limsim_jax.report.pictures", "limsim_jax.report.viewer", "lxml.etree", "matplotlib.backends.backend_agg",
+    "matplotlib.backends.backend_svg", "scipy.stats",
+)  # fmt: skip
+"""Modules that `write_report` imports once it needs them."""
+
 Found = Mapping[tuple[str, str, str], dict[str, Any]]
 
 LISTED = 40
@@ -77,6 +86,12 @@ LISTED = 40
 
 LEAD = 3.0
 """s before its key moment at which a replay opens."""
+
+
+def get_ready() -> None:
+    """Import all that `write_report` needs, for a thread beside other work."""
+    for name in PARTS:
+        importlib.import_module(name)
 
 
 def write_report(
@@ -172,45 +187,72 @@ def _cards(
     """Cards of the worst episodes, and the addresses of their replays."""
     cards, replays, start = [], {}, time.monotonic()
     again: dict[Group, dict[int, tuple[Any, ...]] | str] = {}  # replays by seed, or what went wrong
-    for row in shown:
-        group = row["scenario"], row["policy"]
-        views, fault = [], ""
-        in_time = not again or time.monotonic() - start < seconds
-        if replayer is not None and (group in again or in_time):
-            if group not in again:
-                seeds = [int(one["seed"]) for one in shown if (one["scenario"], one["policy"]) == group]
-                if say is not None:
-                    say(f"replays of {group[0]}, {group[1]}: seeds {', '.join(map(str, seeds))}")
-                try:
-                    again[group] = dict(zip(seeds, replayer(*group, seeds), strict=True))
-                except ValueError as error:  # what cannot be shown is no reason to lose the page
-                    again[group] = str(error)
-            found = again[group]
-            if isinstance(found, str):
-                fault = found
-            else:
-                views, replays[key_of(row)], said = _shown(row, names, path, found[int(row["seed"])])
-                row = {**row, **said}
-        cards.append(card(row, names, views=views, fault=fault, replay=replays.get(key_of(row))))
+    written: list[Future[None]] = []
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for row in shown:
+            group = row["scenario"], row["policy"]
+            views, fault = [], ""
+            in_time = not again or time.monotonic() - start < seconds
+            if replayer is not None and (group in again or in_time):
+                if group not in again:
+                    seeds = [int(one["seed"]) for one in shown if (one["scenario"], one["policy"]) == group]
+                    if say is not None:
+                        say(f"replays of {group[0]}, {group[1]}: seeds {', '.join(map(str, seeds))}")
+                    try:
+                        again[group] = dict(zip(seeds, replayer(*group, seeds), strict=True))
+                    except ValueError as error:  # what cannot be shown is no reason to lose the page
+                        again[group] = str(error)
+                    else:
+                        written += _write_replays(pool, group, again[group], names, path)
+                found = again[group]
+                if isinstance(found, str):
+                    fault = found
+                else:
+                    views, replays[key_of(row)], said = _shown(row, names, found[int(row["seed"])])
+                    row = {**row, **said}
+            cards.append(card(row, names, views=views, fault=fault, replay=replays.get(key_of(row))))
+    for one in written:
+        one.result()
     return cards, replays
 
 
+def _write_replays(
+    pool: Executor, group: Group, found: Mapping[int, tuple[Any, ...]], names: Names, path: Path
+) -> list[Future[None]]:
+    """Begin to write the replays of some seeds beside the page."""
+    from limsim_jax.report.viewer import write_viewer
+
+    folder = path.parent / "replays"
+    folder.mkdir(parents=True, exist_ok=True)
+    jobs = []
+    for seed, (network, lane_map, trace, ego, moments, *more) in found.items():
+        answers = more[1] if len(more) > 1 else ()
+        jobs.append(
+            pool.submit(
+                write_viewer, folder / _replay_name(group, seed), network, lane_map, trace, ego=ego,
+                moments=moments, title=_title(names, group, seed), answers=answers,
+            )
+        )  # fmt: skip
+    return jobs
+
+
+def _replay_name(group: Group, seed: int) -> str:
+    return f"{file_name(group[0])}-{file_name(group[1])}-{seed}.html"
+
+
+def _title(names: Names, group: Group, seed: int) -> str:
+    return f"{names.label(group)}, seed {seed}"
+
+
 def _shown(
-    row: Mapping[str, Any], names: Names, path: Path, replay: tuple[Any, ...]
+    row: Mapping[str, Any], names: Names, replay: tuple[Any, ...]
 ) -> tuple[list[dict[str, str]], str, dict[str, Any]]:
     """Pictures of a key moment, the address of the replay, avoidability."""
     from limsim_jax.report.pictures import pictures
-    from limsim_jax.report.viewer import write_viewer
 
-    network, lane_map, trace, ego, moments, *more = replay
-    answers = more[1] if len(more) > 1 else ()
-    name = f"{file_name(row['scenario'])}-{file_name(row['policy'])}-{int(row['seed'])}.html"
-    folder = path.parent / "replays"
-    folder.mkdir(parents=True, exist_ok=True)
-    title = f"{names.label((row['scenario'], row['policy']))}, seed {row['seed']}"
-    write_viewer(
-        folder / name, network, lane_map, trace, ego=ego, moments=moments, title=title, answers=answers
-    )
+    network, lane_map, trace, ego, moments, *_ = replay
+    group, seed = (row["scenario"], row["policy"]), int(row["seed"])
+    title = _title(names, group, seed)
     views = [
         {
             "alt": f"{title}, {caption}",
@@ -223,7 +265,7 @@ def _shown(
     known = ("avoidable_by_ego", "avoidable_by_other", "module")
     found = {key: worst[key] for key in known if key in worst}
     at = "" if row["time"] is None else f"#t={max(row['time'] - LEAD, 0):.1f}"
-    return views, f"replays/{quote(name)}{at}", found
+    return views, f"replays/{quote(_replay_name(group, seed))}{at}", found
 
 
 # --- metrics
