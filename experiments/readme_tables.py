@@ -220,6 +220,17 @@ def sweep_speed(result: dict[str, Any]) -> str:
     few, more = result["sweeps"][:2]
     seeds, seconds = more["seeds"] - few["seeds"], more["wall_s"] - few["wall_s"]
     rows += ["", f"Most of it is compiling: {seeds:,} worlds of 60 s more take {seconds:.0f} s more."]
+    if result.get("waits"):
+        rows += [
+            "", "With table, report and six replays:", "",
+            "| experiment | policy | seeds | cache | wall, s | CPU, s | memory, MB | compiled | loaded |",
+            "|---|---|---:|---|---:|---:|---:|---:|---:|",
+        ]  # fmt: skip
+    for r in result.get("waits", []):
+        rows.append(
+            f"| {r['experiment']} | {r['policy']} | {r['seeds']} | {r['cache']} | {r['wall_s']:.1f} "
+            f"| {r['cpu_s']:.1f} | {r['peak_memory_mb']:,} | {r['compiled']} | {r['loaded']} |"
+        )
     return "\n".join(rows)
 
 

@@ -1,8 +1,9 @@
-"""How long sweeps take, and how much memory: the paper's five scenarios, and one scenario with many seeds.
+"""How long sweeps take, and how much memory: small ones with their report, one with many seeds, the paper's.
 
-    python experiments/sweep_speed.py [--seeds 1000] [--more 10000] [--only seeds|more|paper]
+    python experiments/sweep_speed.py [--rows wait seeds more paper] [--seeds 1000] [--more 10000]
 
-Every sweep is a process of its own with an empty compilation cache. Writes
+Without `--rows` the small ones, in some minutes; rows that do not run stay as they are. Every sweep is a
+process of its own, with an empty cache or with that of the one before. Writes
 experiments/results/sweep_speed.json and .md.
 """
 
@@ -11,11 +12,11 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,12 @@ from readme_tables import sweep_speed
 RESULTS = Path(__file__).parent / "results"
 
 NAMES = ("seeds", "more", "paper")
-"""The rows."""
+"""The rows of sweeps without a report; `wait` are those with one."""
+
+WAITS = (("intersection", "like_traffic"), ("intersection", "limsim_tm"))
+"""Experiments and policies, each from nothing and warm."""
+
+WAIT_SEEDS = 20
 
 MANY = """
 map = "highway"
@@ -43,35 +49,45 @@ rate = 1500
 """
 
 
-def sweep(experiment: str, seeds: int, folder: Path) -> dict[str, Any]:
-    """One sweep: seconds from the command to the table, MB."""
-    out, cache = folder / f"{Path(experiment).stem}-{seeds}", folder / f"cache-{seeds}"
-    command = [
-        sys.executable,
-        "-m",
-        "limsim_jax.cli",
-        "sweep",
-        experiment,
-        f"--seeds={seeds}",
-        f"--out={out}",
-    ]
+def run(arguments: Sequence[str], cache: Path) -> dict[str, Any]:
+    """One sweep: seconds from the command to its end, MB, programs that were compiled or loaded."""
+    before, start = set(cache.rglob("*.bin")), time.time()
     begin = time.perf_counter()
     with subprocess.Popen(
-        [*command, "--no-report"], stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-m", "limsim_jax.cli", "sweep", *arguments],
         env=os.environ | {"LIMSIM_JAX_CACHE": str(cache)},
-    ) as process:  # fmt: skip
-        text = process.communicate()[0]
-    if process.returncode:
-        raise SystemExit(text)
+    ) as process:
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
     wall = time.perf_counter() - begin
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-    print(text, flush=True)
+    if process.returncode:
+        raise SystemExit(f"{' '.join(arguments)}: exit code {process.returncode}")
+    programs = set(cache.rglob("*.bin"))
+    loaded = [path for path in programs & before if path.stat().st_mtime > start]  # a load touches the file
     return {
-        "experiment": Path(experiment).stem,
-        "seeds": seeds,
         "wall_s": round(wall, 1),
-        "peak_memory_mb": round(peak),
+        "cpu_s": round(used.ru_utime + used.ru_stime, 1),
+        "peak_memory_mb": round(used.ru_maxrss / 1024),
+        "compiled": len(programs - before),
+        "loaded": len(loaded),
     }
+
+
+def sweep(experiment: str, seeds: int, folder: Path) -> dict[str, Any]:
+    """A sweep to its table, with an empty cache."""
+    out = folder / f"{Path(experiment).stem}-{seeds}"
+    found = run([experiment, f"--seeds={seeds}", f"--out={out}", "--no-report"], folder / f"cache-{seeds}")
+    return {"experiment": Path(experiment).stem, "seeds": seeds, **found}
+
+
+def waits(folder: Path) -> Iterator[dict[str, Any]]:
+    """Small sweeps with their report, from nothing and once more."""
+    for experiment, policy in WAITS:
+        cache = folder / f"cache-{experiment}-{policy}"
+        for kind in ("from nothing", "warm"):
+            out = folder / f"{experiment}-{policy}-{kind.replace(' ', '-')}"
+            found = run([experiment, f"--policy={policy}", f"--seeds={WAIT_SEEDS}", f"--out={out}"], cache)
+            yield {"experiment": experiment, "policy": policy, "seeds": WAIT_SEEDS, "cache": kind, **found}
 
 
 def main() -> None:
@@ -79,22 +95,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=1000)
     parser.add_argument("--more", type=int, default=10000)
-    parser.add_argument("--only", choices=NAMES, help="this row; the others stay as they are")
+    parser.add_argument("--rows", nargs="+", choices=("wait", *NAMES), default=["wait"])
     options = parser.parse_args()
     file = RESULTS / "sweep_speed.json"
-    rows = json.loads(file.read_text())["sweeps"] if options.only else [{}] * len(NAMES)
+    found = json.loads(file.read_text()) if file.is_file() else {}
+    rows = found.setdefault("sweeps", [{}] * len(NAMES))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         many = folder / "highway, 60 s.toml"
         many.write_text(f'name = "highway_60"{MANY}')
-        # the peak is that of all children so far: the small one first
         sweeps = ((many, options.seeds), (many, options.more), ("paper", 100))
         for i, (experiment, seeds) in enumerate(sweeps):
-            if options.only in (None, NAMES[i]):
+            if NAMES[i] in options.rows:
                 rows[i] = sweep(str(experiment), seeds, folder)
-    head = "Regenerate: `python experiments/sweep_speed.py`\n\n"
-    file.write_text(json.dumps({"sweeps": rows}, indent=1) + "\n")
-    (RESULTS / "sweep_speed.md").write_text(head + sweep_speed({"sweeps": rows}) + "\n")
+        if "wait" in options.rows:
+            found["waits"] = list(waits(folder))
+    head = "Regenerate: `python experiments/sweep_speed.py --rows wait seeds more paper`\n\n"
+    file.write_text(json.dumps(found, indent=1) + "\n")
+    (RESULTS / "sweep_speed.md").write_text(head + sweep_speed(found) + "\n")
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from limsim_jax.xla import (
     mapped_like,
     run_often,
     run_once,
+    use_all_cores,
 )
 
 
@@ -109,6 +110,31 @@ def test_a_program_that_runs_often_is_compiled_without_idle_passes():
         options: list[Any] = [{"xla_disable_hlo_passes": ""}, run_often()]
         every, some = (lowered.compile(x).as_text() or "" for x in options)
         assert (every.count(" while("), some.count(" while(")) == (0, 1)
+
+
+def test_no_loop_of_a_program_that_runs_often_is_divided_among_threads():
+    def function(x):
+        return jnp.sin(x) * jnp.cos(x) + 1
+
+    lowered = jax.jit(function).lower(jnp.zeros((1024, 1024)))
+    if jax.default_backend() == "cpu":
+        text = lowered.compile(run_often()).as_text() or ""
+        assert "sine" in text and "outer_dimension_partitions" not in text
+
+
+@pytest.mark.parametrize(("spare", "threads"), [(True, "4"), (False, "2")])
+def test_spare_threads_are_for_functions_on_the_host(monkeypatch, spare, threads):
+    monkeypatch.delenv("NPROC", raising=False)
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    use_all_cores(2, spare=spare)
+    assert os.environ["NPROC"] == threads
+
+
+def test_threads_that_the_user_chose_stay(monkeypatch):
+    monkeypatch.setenv("NPROC", "7")
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    use_all_cores(2, spare=False)
+    assert os.environ["NPROC"] == "7"
 
 
 def test_a_program_that_runs_once_is_compiled_without_optimisation():

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from html.parser import HTMLParser
 from io import BytesIO
 from typing import Any
@@ -311,6 +312,25 @@ def test_key_moments_are_pictured_and_replays_written(tmp_path):
     assert all(height(image, EGO) > 10 for image in images)
     # a ring of 61 pixels, and a name below it
     assert [height(image, OTHER) > 60 for image in images] == [True, True, False, False]
+
+
+@pytest.mark.engine
+def test_a_replay_that_cannot_be_written_is_an_error(tmp_path):
+    network, lane_map, trace = small_trace("roundabout")
+
+    def replayer(*key):
+        return [(network, lane_map, trace, 999, [], "more") for _ in key[2]]
+
+    with pytest.raises(ValueError, match="slot 999"):
+        write_report(crashes(), tmp_path / "report.html", replayer=replayer, worst=1)
+
+
+def test_get_ready_imports_all_that_a_report_needs():
+    """Modules that exist, and none of them left to import later."""
+    code = "import sys; from limsim_jax.report.page import get_ready; get_ready(); print(*sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    wanted = {"limsim_jax.report.pictures", "limsim_jax.report.viewer.viewer", "matplotlib.figure"}
+    assert wanted <= set(found.stdout.split())
 
 
 def test_replays_stop_when_the_time_is_up(tmp_path):

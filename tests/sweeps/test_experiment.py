@@ -11,9 +11,12 @@ from traffic_worlds import bundled
 from limsim_jax.cli import common
 from limsim_jax.maps import bundled_maps
 from limsim_jax.maps.lane_map import lane_ids
+from limsim_jax.policies import POLICIES
+from limsim_jax.policies.base import build_policy
 from limsim_jax.sweeps.build import plain_demand
 from limsim_jax.sweeps.episode import Episodes
 from limsim_jax.sweeps.experiment import ExperimentError, bundled_experiments, read_experiments
+from limsim_jax.sweeps.identity import describe
 
 pytestmark = pytest.mark.engine
 
@@ -242,3 +245,34 @@ def test_lists_of_experiments(write):
         read_experiments(write('experiments = ["one.toml"]\nhorizon = 2.0', "more.toml"))
     with pytest.raises(ExperimentError, match="no such file, and no bundled experiment"):
         read_experiments("nothing_of_the_kind")
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "asks"),
+    [
+        ("like_traffic", "", False),
+        ("limsim_tm", "options = { simulations = 20 }", False),
+        ("area_of_interest", 'options = { around = "limsim_tm", radius = 40 }', False),
+        ("language", "", True),
+        ("delayed", 'options = { of = "language" }', True),
+        ("delayed", 'options = { options = { memory = ["mine:factory"] } }', True),
+        ("package.module:factory", "", True),
+    ],
+)
+def test_which_policies_may_ask_the_host_is_known_from_their_names(write, policy, options, asks):
+    (one,) = read_experiments(write(GOOD.replace("[ego]", f'[ego]\npolicy = "{policy}"\n{options}')))
+    assert one.asks_host == asks
+
+
+def test_a_demand_of_sumo_asks_the_host():
+    (one,) = read_experiments("highway")
+    assert not one.asks_host
+    traffic = one.traffic.model_copy(update={"demand": ["a.rou.xml"]})
+    assert one.model_copy(update={"traffic": traffic}).asks_host
+
+
+def test_policies_in_jax_never_ask_the_host():
+    """What `ExperimentFile.asks_host` takes for granted of all names but one."""
+    for name, factory in POLICIES.items():
+        if name != "language":
+            assert "HostPolicy" not in str(describe(build_policy(factory, {}))), name

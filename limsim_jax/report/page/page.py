@@ -16,10 +16,11 @@ The text stands in `page.html.j2`, which escapes every value.
 from __future__ import annotations
 
 import base64
+import contextlib
 import importlib
 import json
-import os
 import math
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -75,7 +76,7 @@ Replayer = Callable[[str, str, Sequence[int]], Sequence[tuple[Any, ...]]]
 
 PARTS = (
     "limsim_jax.report.pictures", "limsim_jax.report.viewer", "lxml.etree", "matplotlib.backends.backend_agg",
-    "matplotlib.backends.backend_svg", "scipy.stats",
+    "matplotlib.backends.backend_svg", "matplotlib.figure", "scipy.stats",
 )  # fmt: skip
 """Modules that `write_report` imports once it needs them."""
 
@@ -89,9 +90,12 @@ LEAD = 3.0
 
 
 def get_ready() -> None:
-    """Import all that `write_report` needs, for a thread beside other work."""
+    """Import all that `write_report` needs, for a thread beside other work.
+
+    What is missing is told where it is needed."""
     for name in PARTS:
-        importlib.import_module(name)
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
 
 
 def write_report(
@@ -199,11 +203,11 @@ def _cards(
                     if say is not None:
                         say(f"replays of {group[0]}, {group[1]}: seeds {', '.join(map(str, seeds))}")
                     try:
-                        again[group] = dict(zip(seeds, replayer(*group, seeds), strict=True))
+                        again[group] = made = dict(zip(seeds, replayer(*group, seeds), strict=True))
                     except ValueError as error:  # what cannot be shown is no reason to lose the page
                         again[group] = str(error)
                     else:
-                        written += _write_replays(pool, group, again[group], names, path)
+                        written += _write_replays(pool, group, made, names, path)
                 found = again[group]
                 if isinstance(found, str):
                     fault = found
@@ -225,12 +229,12 @@ def _write_replays(
     folder = path.parent / "replays"
     folder.mkdir(parents=True, exist_ok=True)
     jobs = []
-    for seed, (network, lane_map, trace, ego, moments, *more) in found.items():
+    for seed, (network, lane_map, trace, ego, marked, *more) in found.items():
         answers = more[1] if len(more) > 1 else ()
         jobs.append(
             pool.submit(
                 write_viewer, folder / _replay_name(group, seed), network, lane_map, trace, ego=ego,
-                moments=moments, title=_title(names, group, seed), answers=answers,
+                moments=marked, title=_title(names, group, seed), answers=answers,
             )
         )  # fmt: skip
     return jobs
