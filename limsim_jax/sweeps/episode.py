@@ -69,11 +69,8 @@ from limsim_jax.types import Config, Scenario, State
 
 _SHARE_OF_MEMORY = 0.25
 _TEMPORARIES = 12  # memory of a running world, in units of its arrays
-_PER_CORE, _AT_ONCE = 10, 2000
-"""Worlds per call, if memory allows: of each core of a CPU, and of all other devices together.
-
-More worlds per core are no faster, and the last chunk of a sweep is half empty more often.
-"""
+_CHUNKS = {"cpu": 50, "gpu": 2000, "tpu": 2000}
+"""Worlds per call, if memory allows: round numbers of seeds leave no chunk half empty."""
 
 AFTERWARDS = 12.0
 """s that a brief replay goes on without its ego: `UNSAFE` s, and the look-ahead of a planner at their end."""
@@ -89,8 +86,7 @@ class Episodes:
 
     Args:
       experiment: the file's tables.
-      chunk: worlds per call; by default as many as memory allows, at most 10 for each core of a CPU and
-        2000 on other devices.
+      chunk: worlds per call; by default as many as memory allows, at most 50 on CPUs and 2000 on others.
       policy: drives the egos; None: the one that the experiment names.
       name: of the policy in results; None: that of the experiment.
       town: the map; None: the one that the experiment names.
@@ -335,10 +331,8 @@ class Episodes:
             memory = stats["bytes_limit"] * jax.local_device_count()
         else:
             memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        most = max(1, int(_SHARE_OF_MEMORY * memory / self.world_bytes))
-        wanted = _PER_CORE * jax.local_device_count() if device.platform == "cpu" else _AT_ONCE
-        if wanted <= most:
-            return wanted
+        most = int(_SHARE_OF_MEMORY * memory / self.world_bytes)
+        most = max(1, min(most, _CHUNKS.get(device.platform, 50)))
         size = 10 ** (len(str(most)) - 1)
         return max(k * size for k in (1, 2, 5) if k * size <= most)
 

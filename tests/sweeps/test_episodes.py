@@ -1,7 +1,6 @@
 """From the engine to the metrics: what an episode is said to be, against loops over its trace."""
 
 import functools
-import os
 from dataclasses import replace
 
 import jax
@@ -297,14 +296,3 @@ def test_an_estimate_of_an_event_in_real_worlds():
     assert all(failure.metrics["contacts"] > 0 for failure in found.failures)
     again = found.episodes.run(range(2)).metrics
     assert [x.metrics["contact_time"] for x in found.failures[:2]] == again["contact_time"].tolist()
-
-
-def test_a_chunk_has_ten_worlds_per_core_or_as_many_as_memory_allows(monkeypatch):
-    assert jax.default_backend() == "cpu"
-    made, devices = Episodes(experiment("like_traffic")), jax.local_device_count()
-    assert made.chunk == 10 * devices
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    monkeypatch.setattr(made, "world_bytes", memory // 4 // 7)
-    assert made._chunk() == 5
-    monkeypatch.setattr(made, "world_bytes", memory)
-    assert made._chunk() == 1
