@@ -117,7 +117,7 @@ def strangers(lanes: Iterable[Lane], reach: float = TOUCHING) -> set[tuple[str, 
     near = STRtree(lines).query(lines, "dwithin", reach)
     joined: dict[tuple[str, int, bool], set[tuple[str, int, bool]]] = defaultdict(set)  # carriageways
     for lane in every:
-        for other in _followers(lane, by_id, 2 * reach):  # a path that bends comes closer than its length
+        for other in lanes_within(lane, by_id, 2 * reach):  # a path that bends comes closer than its length
             after = by_id[other].carriageway
             joined[lane.carriageway].add(after)
             joined[after].add(lane.carriageway)
@@ -448,7 +448,7 @@ def _candidates(
     """Pairs of curves that can conflict, first < second."""
     index = {lane.id: k for k, lane in enumerate(lanes)}
     by_id = {lane.id: lane for lane in lanes}
-    followers = [_followers(lane, by_id, reach) for lane in lanes]
+    followers = [lanes_within(lane, by_id, reach) for lane in lanes]
     pairs: set[tuple[int, int]] = set()
 
     def add(i: int, j: int, curve: Mapping[int, int]) -> None:
@@ -478,15 +478,18 @@ def _candidates(
     return [(int(a), int(b)) for a, b in found[meet]]
 
 
-def _followers(lane: Lane, lanes: Mapping[str, Lane], reach: float) -> set[str]:
-    """Ids of lanes that start less than `reach` m after this one."""
+def lanes_within(lane: Lane, lanes: Mapping[str, Lane], reach: float, links: str = "successors") -> set[str]:
+    """Ids of lanes that start less than `reach` m after this one.
+
+    With `links` "predecessors", of those that end as little before it.
+    """
     found: set[str] = set()
-    todo = [(name, 0.0) for name in lane.successors]
+    todo = [(name, 0.0) for name in getattr(lane, links)]
     while todo:
         name, gap = todo.pop()
         if name in lanes and name not in found and gap < reach:
             found.add(name)
-            todo.extend((after, gap + lanes[name].length) for after in lanes[name].successors)
+            todo.extend((after, gap + lanes[name].length) for after in getattr(lanes[name], links))
     return found - {lane.id}
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from limsim_jax.maps.conflicts.overlaps import Overlap
+from limsim_jax.maps.conflicts.overlaps import Overlap, lanes_within
 from limsim_jax.maps.conflicts.table import ConflictTable, ConflictType
 from limsim_jax.maps.network import Control, Lane, LaneType, Movement, Network, Turn
 
@@ -161,20 +161,12 @@ class RightOfWay:
             return 0
         if set(lane.successors) & set(other.successors) or set(lane.predecessors) & set(other.predecessors):
             return 0  # they merge or part
-        comes, leads = (self._meets(lane, links, other.junction) for links in ("predecessors", "successors"))
+        lanes = self.network.lanes
+        comes, leads = (
+            any(lanes[name].junction == other.junction for name in lanes_within(lane, lanes, _NEAR, links))
+            for links in ("predecessors", "successors")
+        )
         return comes - leads
-
-    def _meets(self, lane: Lane, links: str, junction: str) -> bool:
-        """Whether links lead to a junction within `_NEAR`."""
-        lanes, todo, seen = self.network.lanes, [(name, 0.0) for name in getattr(lane, links)], set[str]()
-        while todo:
-            name, way = todo.pop()
-            if name in lanes and name not in seen and way < _NEAR:
-                seen.add(name)
-                if lanes[name].junction == junction:
-                    return True
-                todo.extend((after, way + lanes[name].length) for after in getattr(lanes[name], links))
-        return False
 
     def _between(self, one: Path, two: Path, overlap: Overlap) -> Decision:
         turned = math.remainder(two.approach - one.approach, 2 * math.pi)  # > 0: two comes from the right
