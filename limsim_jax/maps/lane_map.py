@@ -84,6 +84,7 @@ class LaneMap:
     length: Float[Array, " L"]  # m
     speed_limit: Float[Array, " L"]  # m/s
     stop_s: Float[Array, " L"]  # m, where the front bumper stops: last stop line or end of the lane
+    stand_back: Float[Array, " L"]  # m before `stop_s`, to wait out of the way of a path over the line
     start_s: Float[Array, " L"]  # m, where an opening lane becomes wide enough; otherwise 0
     end_s: Float[Array, " L"]  # m, where a closing lane becomes too narrow; otherwise its length
     curvature_max: Float[Array, " L"]  # 1/m, largest |mean curvature| over any `rasterise.TURN_WINDOW`

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from limsim_jax.geometry import derivative, polynomial
 from limsim_jax.maps.bridges import goes_on_beside, side_step
-from limsim_jax.maps.conflicts import build_conflicts
+from limsim_jax.maps.conflicts import build_conflicts, stand_back
 from limsim_jax.maps.lane_map import (
     CELL,
     EARLIER,
@@ -162,7 +162,10 @@ def build_lane_map(
         **_grid(raster, rows, size),
     }
     order = lane_rows(network)
-    rules = _rule_tables(network, goals, routes or {}, num_lanes, size, keep_foes="foes" in (least or {}))
+    stop_s = tables["stop_s"]
+    rules = _rule_tables(
+        network, goals, routes or {}, stop_s, num_lanes, size, keep_foes="foes" in (least or {})
+    )
     lane_map = LaneMap(
         **arrays,
         **rules,
@@ -232,6 +235,7 @@ def _rule_tables(
     network: Network,
     goals: Goals,
     prescribed: Mapping[str, Sequence[str]],
+    stop_s: NDArray[np.float64],
     num_lanes: int,
     least: Mapping[str, int],
     *,
@@ -262,6 +266,7 @@ def _rule_tables(
     if not foes and not keep_foes:
         size["foes"] = 0  # a program without conflicts is a third faster
     return {
+        "stand_back": _pad(stand_back(network, rows, conflicts, stop_s), num_lanes, 0.0),
         "conflicts": conflicts.pad(lanes=num_lanes, connectors=size["connectors"], foes=size["foes"]),
         "routes": routes.pad(lanes=num_lanes, goals=size["goals"]),
         "signals": signals.pad(

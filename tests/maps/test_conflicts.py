@@ -32,7 +32,7 @@ from limsim_jax.maps.conflicts import (
 )
 from limsim_jax.maps.conflicts.build import MARGIN, VEHICLE_WIDTH
 from limsim_jax.maps.conflicts.table import ABSENT
-from limsim_jax.maps.conflicts.waiting import hold_back
+from limsim_jax.maps.conflicts.waiting import hold_back, stand_back
 from limsim_jax.maps.network import Control, LaneType, Turn
 
 REACH = VEHICLE_WIDTH + MARGIN
@@ -163,6 +163,38 @@ def test_where_a_car_waits_inside_a_junction_it_is_in_the_way_of_no_path_with_pr
 
 def overlap(begin, end, kind):
     return Overlap(first=0, second=1, s_in=begin, s_out=end, f_in=0.0, f_out=1.0, type=kind)
+
+
+@pytest.mark.parametrize(
+    ("crossed", "last", "line", "back"),
+    [
+        ((47.0,), 50.0, 50.0, 3.0 + REACH),
+        ((47.0,), 0.2, 0.2, 3.0 + REACH),  # behind the connector of another junction
+        ((43.0,), 50.0, 46.0, 3.0 + REACH),  # a car at its line reaches from 41 m to 46 m: over the path
+        ((42.0,), 50.0, 50.0, 0.0),  # room for a car behind the path
+        ((47.0, 40.0), 50.0, 50.0, 10.0 + REACH),  # before that path it would stand on the next
+        ((47.0, 41.0, 35.0, 29.0, 23.0), 50.0, 50.0, 0.0),  # too far away
+    ],
+)
+def test_where_traffic_waits_before_a_junction_whose_paths_lie_over_its_lane(crossed, last, line, back):
+    """A lane of 50 m in all leads to a junction; paths of that junction cross it."""
+    lanes = [
+        straight("in", (50.0 - last, 0.0), 0.0, last, successors=("a",)),
+        straight("a", (50.0, 0.0), 0.0, 20.0, junction="J"),
+        *(
+            straight(f"b{i}", (x, -20.0), math.pi / 2, 40.0, junction="J", road=f"b{i}")
+            for i, x in enumerate(crossed)
+        ),
+    ]
+    if last < 50:
+        lanes.append(straight("first", (0.0, 0.0), 0.0, 50.0 - last, junction="K", successors=("in",)))
+    net = network(lanes)
+    row = rows(net)
+    stop_s = np.array([lane.length for lane in net.drivable_lanes()])
+    stop_s[row["in"]] = line
+    found = stand_back(net, row, build_conflicts(net, row), stop_s)
+    assert found[row["in"]] == pytest.approx(back, abs=0.01)
+    assert not np.delete(found, row["in"]).any()
 
 
 def test_bridges_do_not_conflict():

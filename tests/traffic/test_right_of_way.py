@@ -25,7 +25,8 @@ from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Traffic, decide, drive
 from limsim_jax.traffic.motion import boxes
-from limsim_jax.traffic.right_of_way import Approaches, passage, travel_time
+from limsim_jax.traffic.neighbors import look_ahead
+from limsim_jax.traffic.right_of_way import Approaches, approaches_ahead, passage, travel_time
 from limsim_jax.traffic.right_of_way.stops import stop_signs, stops_at_lights
 from limsim_jax.traffic.signals import DETECTOR, GAP, crosses_on_red, switch
 from limsim_jax.traffic.state import start_state
@@ -175,7 +176,7 @@ def rows_of(line, n):
     zero = np.zeros(n)
     return Approaches(
         one(zero, jnp.int32), one(zero, jnp.int32), one(-line - 1, jnp.float32), one(line, jnp.float32),
-        one(zero, jnp.float32),
+        one(zero, jnp.float32), jnp.zeros((n, 2), bool),
     )  # fmt: skip
 
 
@@ -219,6 +220,33 @@ def test_yellow_is_a_dilemma_that_the_braking_decides():
     for light, priority in ((SignalState.YELLOW, 0), (SignalState.RED, 2)):
         _, major = stops_at_lights(state, inside, speed, jnp.full(4, int(light)), shown)
         assert (np.asarray(major) == priority).all()
+
+
+def test_a_light_counts_for_all_connectors_of_a_movement():
+    """Three connectors: two of one junction, the first with a light, and one of the next junction."""
+    state = state_of("highway", [0, 0], [0.0, 0.0], [0.0, 0.0], [0, 0])
+    lights = jnp.array([SignalState.RED, SignalState.OFF, SignalState.GREEN_MINOR], jnp.int32)
+    rows = Approaches(
+        connector=jnp.zeros((2, 3), jnp.int32), lane=jnp.array([[0, 1, 1], [2, 1, 1]]),
+        x=jnp.tile(jnp.array([-1.5, -9.0, -30.0]), (2, 1)),
+        line=jnp.tile(jnp.array([1.5, 1.5, 25.0]), (2, 1)),
+        soonest=jnp.zeros((2, 3)), goes_on=jnp.tile(jnp.array([False, True, False]), (2, 1)),
+    )  # fmt: skip
+    where, major = stops_at_lights(state, rows, jnp.full((2, 3), 8.0), lights, jnp.zeros((2, 3)))
+    np.testing.assert_array_equal(np.asarray(where) < NO_GAP, [[True, True, False], [False, False, False]])
+    np.testing.assert_array_equal(major, [[0, 0, 0], [-1, -1, 0]])
+
+
+def test_traffic_waits_further_back_where_its_line_lies_over_a_path():
+    """A vehicle that has passed that place waits at the line."""
+    _, lane_map = bundled("intersection")
+    lane, goal = straight_on(lane_map)[0]
+    line = float(lane_map.stop_s[lane])
+    lane_map = dataclasses.replace(lane_map, stand_back=lane_map.stand_back.at[lane].set(8.0))
+    for before, expected in ((30.0, 22.0), (8.5, 0.5), (7.0, 7.0), (2.0, 2.0)):
+        state = state_of("intersection", [lane], [line - before], [3.0], [goal])
+        found = approaches_ahead(CONFIG, lane_map, state, look_ahead(CONFIG, lane_map, state))
+        assert float(found.line[0, 0]) == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_vehicle_that_stops_at_yellow_goes_on_stopping():
@@ -323,6 +351,7 @@ def test_a_stop_sign_behind_another_connector_counts_for_a_vehicle_that_stands_b
         connector=jnp.tile(jnp.array([0, 1], jnp.int32), (n, 1)), lane=jnp.zeros((n, 2), jnp.int32),
         x=jnp.array([[6.0, -0.7], [6.0, -0.7], [-20.0, -30.0]]),
         line=jnp.array([[-NO_GAP, 0.5], [-NO_GAP, 0.5], [20.0, 30.0]]), soonest=jnp.zeros((n, 2)),
+        goes_on=jnp.zeros((n, 2), bool),
     )  # fmt: skip
     nothing = jnp.zeros(n, jnp.int32)
     state = start_state(

@@ -5,7 +5,7 @@ than the width of a vehicle and a margin. The package works once per map, on the
 
 - `overlaps` finds the stretches where that holds;
 - `priority` decides which of the two lanes has the right of way;
-- `waiting` finds where a vehicle can wait inside a junction;
+- `waiting` finds where a vehicle can wait inside a junction, and how far before another;
 - `build` writes all of it into a `table` of fixed size for the device.
 """
 
@@ -13,6 +13,7 @@ from limsim_jax.maps.conflicts.build import build_conflicts
 from limsim_jax.maps.conflicts.overlaps import Overlap, connectors, find_overlaps
 from limsim_jax.maps.conflicts.priority import priority_cycles, roundabout_lanes
 from limsim_jax.maps.conflicts.table import ConflictTable, ConflictType
+from limsim_jax.maps.conflicts.waiting import stand_back
 
 __all__ = [
     "ConflictTable",
@@ -23,4 +24,5 @@ __all__ = [
     "find_overlaps",
     "priority_cycles",
     "roundabout_lanes",
+    "stand_back",
 ]

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from limsim_jax.maps.conflicts.overlaps import Overlap
 from limsim_jax.maps.conflicts.priority import RightOfWay
-from limsim_jax.maps.conflicts.table import ConflictType
+from limsim_jax.maps.conflicts.table import ConflictTable, ConflictType
 from limsim_jax.maps.network import Lane, Movement, Network
 
 CAR = 5.0
 """Length (m) of a car that waits inside a junction."""
+
+FARTHEST = 20.0
+"""How far (m) before the end of its lane traffic waits at most, out of the way of another junction."""
 
 
 def waiting_points(
@@ -73,6 +77,63 @@ def hold_back(place: float, row: Sequence[tuple[Overlap, int, int]]) -> float:
         if lower == place:
             return place
         place = lower
+
+
+def stand_back(
+    network: Network, rows: Mapping[str, int], table: ConflictTable, stop_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How far before the stop lines traffic waits.
+
+    A lane that leads into a junction may lie over a path of that junction. A car that waits at its line would
+    stand in the way of those that it waits for, so it waits before that path.
+
+    Args:
+        network: the map.
+        rows: row of every drivable lane.
+        table: the conflicts of the map.
+        stop_s: the stop line of every lane (m).
+
+    Returns:
+        m for every row of `rows`; 0 where the line itself is clear, or where that would be too far away.
+    """
+    back = np.zeros(len(rows))
+    lanes = list(network.drivable_lanes())
+    junction = np.array([lanes[row].junction or "" for row in table.lane[:-1]] + [""])
+    foreign = (table.type == ConflictType.CROSS) & (table.prio < 0)
+    foreign &= (junction[table.foe] != junction[:, None]) & (junction[table.foe] != "")
+    across: dict[str, list[tuple[str, float, float]]] = {}
+    for k, c in zip(*np.nonzero(foreign), strict=True):
+        stretch = str(junction[table.foe[k, c]]), float(table.s_in[k, c]), float(table.s_out[k, c])
+        across.setdefault(lanes[table.lane[k]].id, []).append(stretch)
+    if not across:
+        return back
+    for lane in lanes:
+        into = {network.lanes[name].junction for name in lane.successors if name in rows}
+        into -= {lane.junction, None}
+        line = lane.length - float(stop_s[rows[lane.id]])
+        stretches = [
+            (end - s_out, end - s_in)
+            for name, end in _before(network, lane)
+            for other, s_in, s_out in across.get(name, ())
+            if other in into
+        ]
+        place = line
+        while further := [far for near, far in stretches if near < place + CAR and far > place]:
+            place = max(further)
+        if place <= FARTHEST:
+            back[rows[lane.id]] = place - line
+    return back
+
+
+def _before(network: Network, lane: Lane) -> Iterator[tuple[str, float]]:
+    """A lane and those before it, and where each begins (m before its end)."""
+    todo = [(lane.id, lane.length)]
+    while todo:
+        name, end = todo.pop()
+        yield name, end
+        if end < FARTHEST:
+            before = network.lanes[name].predecessors
+            todo.extend((x, end + network.lanes[x].length) for x in before if x in network.lanes)
 
 
 def _opposed(movement: Movement, k: int, foes: Iterable[tuple[float, int]], right_of_way: RightOfWay) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, bend_speed
 from limsim_jax.traffic.car_following import NO_GAP
@@ -22,6 +22,7 @@ class Approaches(NamedTuple):
     x: Float[Array, "N R"]  # m, front bumper along the connector; negative before it
     line: Float[Array, "N R"]  # m to the place to wait before the junction; negative once passed
     soonest: Float[Array, "N R"]  # s until the start of the connector, by what the lanes before it allow
+    goes_on: Bool[Array, "N R"]  # through the same junction as the connector before
 
 
 def approaches_ahead(config: Config, lane_map: LaneMap, state: State, ahead: Ahead) -> Approaches:
@@ -39,6 +40,7 @@ def approaches_ahead(config: Config, lane_map: LaneMap, state: State, ahead: Ahe
     count = jnp.cumsum(connector >= 0, -1)
     junction = lane_map.junction[ahead.lane]
     setback = (lane_map.length - lane_map.stop_s)[ahead.lane]
+    stand_back = lane_map.stand_back[ahead.lane]
     found, line = [], jnp.full_like(state.s, -NO_GAP)
     soonest = _soonest(lane_map, state, ahead)
     inside = jnp.full_like(state.lane, -1)
@@ -51,9 +53,11 @@ def approaches_ahead(config: Config, lane_map: LaneMap, state: State, ahead: Ahe
         before = jnp.maximum(index - 1, 0)
         enters = (index[:, 0] > 0) & (which >= 0) & (pick(junction, before) != which)
         # the line of a junction holds for all its connectors; a vehicle inside has none
-        line = jnp.where(
-            enters, start - pick(setback, before), jnp.where((which >= 0) & (which == inside), line, -NO_GAP)
-        )
+        at_line = start - pick(setback, before)
+        back = at_line - pick(stand_back, before)
+        at_line = jnp.where(back > -JUNCTIONS.margin, back, at_line)
+        goes_on = exists & ~enters & (which >= 0) & (which == inside)
+        line = jnp.where(enters, at_line, jnp.where(goes_on, line, -NO_GAP))
         inside = which
         found.append(
             (
@@ -62,9 +66,23 @@ def approaches_ahead(config: Config, lane_map: LaneMap, state: State, ahead: Ahe
                 jnp.where(exists, -start, -NO_GAP),
                 jnp.where(exists, line, -NO_GAP),
                 jnp.where(exists, pick(soonest, index), 0),
+                goes_on,
             )
         )
     return Approaches(*(jnp.stack(column, -1) for column in zip(*found, strict=True)))
+
+
+def throughout(approaches: Approaches, x: Array) -> Array:
+    """Let what holds at the entry of a junction hold throughout it.
+
+    Args:
+      approaches: connectors ahead.
+      x: `[N, R]`; 0 or False where a connector says nothing itself.
+    """
+    columns, says = [x[:, 0]], x.astype(bool)
+    for r in range(1, x.shape[1]):
+        columns.append(jnp.where(approaches.goes_on[:, r] & ~says[:, r], columns[-1], x[:, r]))
+    return jnp.stack(columns, -1)
 
 
 def _soonest(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, "N D"]:

@@ -13,7 +13,7 @@ from limsim_jax.maps.signals import lane_states
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.neighbors import Pair
 from limsim_jax.traffic.parameters import JUNCTIONS
-from limsim_jax.traffic.right_of_way.approaches import Approaches
+from limsim_jax.traffic.right_of_way.approaches import Approaches, throughout
 from limsim_jax.traffic.right_of_way.meet import meet
 from limsim_jax.traffic.right_of_way.passage import Observed
 from limsim_jax.traffic.right_of_way.stops import (
@@ -64,6 +64,8 @@ def give_way(
     # it stands for long and does not yield, so it waits for something that others do not see
     queued |= (state.v < stands) & (state.waiting > JUNCTIONS.tie_time) & ~state.yielding & ~starts
     sign, stopped = stop_signs(lane_map, state, approaches)
+    # a vehicle that has yet to stop at a sign does not come before it has
+    held = throughout(approaches, (at_light < NO_GAP) | full | sign)
 
     def everywhere(x: Array) -> Array:
         return jnp.broadcast_to(x[:, None] if x.ndim == 1 else x, approaches.connector.shape).astype(
@@ -81,8 +83,7 @@ def give_way(
         brake=everywhere(brake),
         waiting=everywhere(state.waiting),
         line=approaches.line,
-        # a vehicle that has yet to stop at a sign does not come before it has
-        blocked=everywhere((at_light < NO_GAP) | full | queued[:, None] | sign),
+        blocked=everywhere(held | queued[:, None]),
         yielding=everywhere(state.yielding),
         slowing=everywhere(state.a < -JUNCTIONS.slowing),
         light=light.astype(jnp.float32),

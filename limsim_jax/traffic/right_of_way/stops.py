@@ -10,7 +10,7 @@ from limsim_jax.maps.signal_table import SignalState
 from limsim_jax.traffic.car_following import NO_GAP
 from limsim_jax.traffic.neighbors import Pair
 from limsim_jax.traffic.parameters import JUNCTIONS
-from limsim_jax.traffic.right_of_way.approaches import Approaches
+from limsim_jax.traffic.right_of_way.approaches import Approaches, throughout
 from limsim_jax.types import State
 
 
@@ -61,8 +61,10 @@ def stops_at_lights(
     minor = (light == SignalState.GREEN_MINOR) | (light == SignalState.STOP)
     major = jnp.where(light == SignalState.GREEN_MAJOR, 1, jnp.where(minor, -1, 0))
     left_over = (approaches.line < -JUNCTIONS.margin) & at_red  # clears the junction first
+    light = throughout(approaches, jnp.where(left_over, 2, major))
+    stops = throughout(approaches, stops)
     stop = jnp.where(stops, jnp.maximum(approaches.line - JUNCTIONS.margin, -JUNCTIONS.margin), NO_GAP)
-    return stop, jnp.where(left_over, 2, major)
+    return stop, light
 
 
 def exit_full(lane_map: LaneMap, state: State, approaches: Approaches, own: Pair) -> Bool[Array, "N R"]:
