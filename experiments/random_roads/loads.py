@@ -144,7 +144,10 @@ def demand_of(loaded: Loaded, level: str, seed: int, seconds: float) -> tuple[De
     names, lanes = plain_origins(network, lane_map), origins(network)
     rng = np.random.default_rng([seed, 1])
     rates = {name: FIRST_RATE * len(lanes.get(name, [""])) * float(rng.uniform(0.6, 1.4)) for name in names}
-    flow = _flows(lane_map, _build(loaded, rates, 0, seconds))
+    if names:
+        flow = _flows(lane_map, _build(loaded, rates, 0, seconds))
+    else:  # a ring: what is on it stays there
+        flow = np.where(np.asarray(lane_map.valid), SATURATION, 0.0)
     scale = LEVELS[level] / max(_used(network, lane_map, flow), 1e-6)
     rates = {name: max(rate * scale, LEAST_RATE) for name, rate in rates.items()}
     outside = np.asarray(lane_map.valid) & ~np.asarray(lane_map.is_connector)

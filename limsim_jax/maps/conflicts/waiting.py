@@ -126,7 +126,7 @@ def stand_back(
 
 
 def _before(network: Network, lane: Lane) -> Iterator[tuple[str, float]]:
-    """A lane and those before it, and where each begins (m before its end)."""
+    """A lane and those before it; each with m from its start to the end."""
     todo = [(lane.id, lane.length)]
     while todo:
         name, end = todo.pop()
