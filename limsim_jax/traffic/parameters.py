@@ -187,6 +187,13 @@ class Junctions:
     starting: float = _number(
         0.2, "m/s^2", "acceleration above which a vehicle that stood moves off", "chosen", (0.05, 1.0)
     )
+    pulling_out: float = _number(
+        2.0,
+        "m",
+        "distance to a conflict area below which a vehicle that moves off does not stop for one that can wait",
+        "chosen: the first step of a start, and the margin",
+        (0.0, 5.0),
+    )
     slowing: float = _number(
         1.0,
         "m/s^2",

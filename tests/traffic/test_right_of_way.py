@@ -64,7 +64,7 @@ def random_vehicles(n, seed):
         "top_speed": np.maximum(v, slow), "a": rng.uniform(0.8, 2.5, n), "brake": v * v / 8,
         "waiting": rng.choice([0.0, 2.0, 10.0, 40.0], n), "line": rng.uniform(-20, 40, n),
         "blocked": rng.integers(0, 2, n) * 1.0, "yielding": rng.integers(0, 2, n) * 1.0,
-        "slowing": rng.integers(0, 2, n) * 1.0,
+        "slowing": rng.integers(0, 2, n) * 1.0, "starts": rng.integers(0, 2, n) * 1.0,
         "light": rng.choice([-1.0, 0.0, 1.0, 2.0], n), "slot": np.arange(n) * 1.0 + 1000 * seed,
         "soonest": rng.uniform(0, 8, n),
     }  # fmt: skip
@@ -107,7 +107,8 @@ def meeting(me, foe, *, prio=1, **same):
     """Two vehicles before a crossing of their paths; whether the first goes first."""
     usual = {
         "front": 0.0, "length": 4.5, "v": 0.0, "top_speed": 10.0, "turn_speed": 10.0, "a": 1.5, "brake": 0.0,
-        "waiting": 0.0, "line": 0.5, "blocked": 0.0, "yielding": 0.0, "slowing": 0.0, "light": 0.0,
+        "waiting": 0.0, "line": 0.5, "blocked": 0.0, "yielding": 0.0, "slowing": 0.0, "starts": 0.0,
+        "light": 0.0,
         "soonest": 0.0,
     }  # fmt: skip
     both = [

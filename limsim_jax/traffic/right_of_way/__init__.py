@@ -6,7 +6,7 @@ vehicles exactly one goes first, and both see it alike, because both evaluate th
 same state with the roles swapped:
 
 1. A vehicle inside the conflict area goes before one outside; one that can no longer stop before one
-   that can.
+   that can; one that pulls out from the line before one that can wait.
 2. Otherwise a vehicle that stands where other paths cross goes first, then the one with priority: by the
    light, by the map, between equals the one in the junction, right before left, the longer waiting
    time, the earlier arrival. At a four-way stop the first that has come goes first.

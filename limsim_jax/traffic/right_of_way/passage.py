@@ -31,6 +31,7 @@ class Observed(NamedTuple):
     blocked: Array  # 1 if a light, a sign, a full exit or a queue stops it
     yielding: Array  # 1 if it stood for the right of way at the last decision
     slowing: Array  # 1 if it brakes, and so may stop on its way
+    starts: Array  # 1 if it moves off, or drives faster and faster
     light: Array  # 1 if the light gives priority, -1 if it takes it, 2 if it clears the junction
     slot: Array
     soonest: Array  # s, least time to the start of the connector
@@ -133,9 +134,7 @@ def compare(
     """
     margin = JUNCTIONS.margin
     my_distance, foe_distance = mine.start - me.front, theirs.start - foe.front
-    # 2: inside, 1: can no longer stop, 0: can wait
-    my_level = (my_distance <= -margin).astype(jnp.int32) + (my_distance < me.brake).astype(jnp.int32)
-    foe_level = (foe_distance <= -margin).astype(jnp.int32) + (foe_distance < foe.brake).astype(jnp.int32)
+    my_level, foe_level = _level(me, my_distance), _level(foe, foe_distance)
     my_arrival, foe_arrival = computed_once(
         (
             arrival_time(me, mine.start),
@@ -147,7 +146,7 @@ def compare(
     my_rest, foe_rest = mine.end - me.front, theirs.end - foe.front
     nearer = jnp.where(my_rest == foe_rest, before, my_rest < foe_rest)
     sooner = jnp.where(my_arrival == foe_arrival, before, my_arrival < foe_arrival)
-    first = jnp.where(my_level == 2, nearer, sooner)
+    first = jnp.where(my_level == 3, nearer, sooner)
     first = jnp.where(my_level != foe_level, my_level > foe_level, first)
 
     # between vehicles that can still choose: the one with priority
@@ -172,6 +171,14 @@ def compare(
             theirs=_passage(foe, theirs, foe_gap, me, foe_distance, foe_arrival, merges),
         )
     )
+
+
+def _level(vehicle: Observed, distance_in: Array) -> Array:
+    """3: inside the conflict area, 2: cannot stop before it, 1: pulls out into it, 0: can wait."""
+    inside, comes = distance_in <= -JUNCTIONS.margin, distance_in < vehicle.brake
+    pulls_out = (vehicle.starts > 0) & (distance_in < JUNCTIONS.pulling_out)
+    level = comes.astype(jnp.int32) * 2 + inside.astype(jnp.int32)
+    return jnp.maximum(level, pulls_out.astype(jnp.int32))
 
 
 def _passage(

@@ -86,6 +86,7 @@ def give_way(
         blocked=everywhere(held | queued[:, None]),
         yielding=everywhere(state.yielding),
         slowing=everywhere(state.a < -JUNCTIONS.slowing),
+        starts=everywhere((state.a > JUNCTIONS.starting) & (state.v > 0)),
         light=light.astype(jnp.float32),
         slot=everywhere(jnp.arange(n)),
         soonest=approaches.soonest,
