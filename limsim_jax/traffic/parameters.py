@@ -190,7 +190,7 @@ class Junctions:
     pulling_out: float = _number(
         2.0,
         "m",
-        "distance to a conflict area below which a vehicle that moves off does not stop for one that can wait",
+        "to a conflict area: nearer, a vehicle that moves off does not stop for one that can wait",
         "chosen: the first step of a start, and the margin",
         (0.0, 5.0),
     )

@@ -18,6 +18,7 @@ from limsim_jax.traffic.right_of_way.meet import meet
 from limsim_jax.traffic.right_of_way.passage import Observed
 from limsim_jax.traffic.right_of_way.stops import (
     exit_full,
+    keeps_clear,
     stop_signs,
     stops_at_conflicts,
     stops_at_lights,
@@ -98,8 +99,11 @@ def give_way(
         lead, lead_gap = jnp.full(n, -1, jnp.int32), jnp.full(n, NO_GAP, jnp.float32)
     wait_s = table.wait_s[approaches.connector]
     stop, waits = stops_at_conflicts(wait_s, approaches, observed.brake, until, sign | full)
+    stop = jnp.minimum(stop, at_light)
+    stop, full = keeps_clear(lane_map, state, approaches, own, observed.brake, stop)
+    waits |= full
     yielding = state.active & waits.any(-1) & (state.v < stands)  # a vehicle that moves may yet come
-    stop = jnp.minimum(stop, at_light).min(-1)
+    stop = stop.min(-1)
     return RightOfWay(
         stop=jnp.where(state.active, stop, NO_GAP),
         lead=lead,

@@ -13,6 +13,8 @@ from limsim_jax.traffic.parameters import JUNCTIONS
 from limsim_jax.traffic.right_of_way.approaches import Approaches, throughout
 from limsim_jax.types import State
 
+_LEADERS = 3  # vehicles of a queue whose stops are looked at
+
 
 def stops_at_lights(
     state: State,
@@ -81,6 +83,52 @@ def exit_full(lane_map: LaneMap, state: State, approaches: Approaches, own: Pair
     slow = (own.lead >= 0) & (state.v[own.lead] < JUNCTIONS.standstill)
     room = own.lead_gap + JUNCTIONS.exit_time * state.v[own.lead]
     return (clear > 0) & slow[:, None] & (room[:, None] < needed) & (approaches.line > -JUNCTIONS.margin)
+
+
+def keeps_clear(
+    lane_map: LaneMap,
+    state: State,
+    approaches: Approaches,
+    own: Pair,
+    brake: Float[Array, "N R"],
+    stop: Float[Array, "N R"],
+) -> tuple[Float[Array, "N R"], Bool[Array, "N R"]]:
+    """Wait before a junction if the next stop leaves the tail where other paths cross.
+
+    That is the stop for a junction further on, or behind a leader that has to stop for one.
+
+    Args:
+      lane_map: where.
+      state: the world.
+      approaches: connectors ahead.
+      own: leader and follower on the own route.
+      brake: m, to stop with `firm_braking`.
+      stop: m to where a vehicle has to stop for each connector, NO_GAP if it need not.
+
+    Returns:
+      m to where it stops for each, and for which it waits for the next junction.
+    """
+    clear = lane_map.conflicts.cross_s[approaches.connector]
+    needed = clear - approaches.x + state.shape.length[:, None]
+    comes = first = stop.min(-1)
+    for _ in range(_LEADERS):
+        behind = jnp.where(own.lead >= 0, own.lead_gap + comes[own.lead] - state.driver.s0, NO_GAP)
+        comes = jnp.minimum(first, behind)
+    ahead = (approaches.line > -JUNCTIONS.margin) & (approaches.line + JUNCTIONS.margin > brake) & (clear > 0)
+    line = jnp.maximum(approaches.line - JUNCTIONS.margin, -JUNCTIONS.margin)
+    places, waits = [], []
+    here = later = jnp.full_like(state.s, NO_GAP)  # first stops in the junction of a connector, and beyond
+    goes_on = jnp.zeros_like(state.active)
+    for r in reversed(range(stop.shape[1])):
+        later = jnp.where(goes_on, later, jnp.minimum(later, here))
+        full = (later < needed[:, r]) | ((behind < needed[:, r]) & (behind > approaches.line[:, r]))
+        full &= ahead[:, r]
+        place = jnp.where(full, jnp.minimum(stop[:, r], line[:, r]), stop[:, r])
+        here = jnp.where(goes_on, jnp.minimum(here, place), place)
+        goes_on = approaches.goes_on[:, r]
+        places.append(place)
+        waits.append(full)
+    return jnp.stack(places[::-1], -1), jnp.stack(waits[::-1], -1)
 
 
 def stop_signs(
