@@ -25,9 +25,9 @@ from limsim_jax.traffic.command import Command
 from limsim_jax.traffic.demand import Flow, build_demand, sample_scenario
 from limsim_jax.traffic.engine import Traffic, decide, drive
 from limsim_jax.traffic.motion import boxes
-from limsim_jax.traffic.neighbors import look_ahead
+from limsim_jax.traffic.neighbors import Pair, look_ahead
 from limsim_jax.traffic.right_of_way import Approaches, approaches_ahead, passage, travel_time
-from limsim_jax.traffic.right_of_way.stops import stop_signs, stops_at_lights
+from limsim_jax.traffic.right_of_way.stops import keeps_clear, stop_signs, stops_at_lights
 from limsim_jax.traffic.signals import DETECTOR, GAP, crosses_on_red, switch
 from limsim_jax.traffic.state import start_state
 from limsim_jax.traffic.vehicles import default_population
@@ -153,6 +153,58 @@ def test_a_vehicle_stopped_on_a_crossing_goes_before_vehicles_that_can_wait():
     # but not before a vehicle that can no longer stop, or only in haste
     assert not meeting(inside, comes | {"front": 4.0, "v": 4.0}, prio=-1)(obstructing=(True, False))
     assert not meeting(inside, comes | {"front": 7.0}, prio=-1)(obstructing=(True, False))
+
+
+def test_a_vehicle_that_pulls_out_does_not_stop_again_for_one_that_can_wait():
+    """Else two at their lines side by side would start and stop by turns."""
+    starts, stands = {"front": 6.5, "v": 0.4, "starts": 1.0}, {"front": 6.6}
+    assert meeting(starts, stands, prio=-1)() and not meeting(stands, starts)()
+    # but for one that comes and cannot stop, and where it is not at the conflict area yet
+    assert not meeting(starts, {"front": 4.0, "v": 8.0, "turn_speed": 8.0}, prio=-1)()
+    assert not meeting(starts | {"front": 5.5}, stands, prio=-1)()
+    assert not meeting(starts | {"starts": 0.0}, stands, prio=-1)()
+
+
+def clear_rows(n, line, start, goes_on, connector):
+    """Approaches `[n, R]` with the same rows for all vehicles."""
+    tile = lambda x, dtype: jnp.tile(jnp.asarray(x, dtype), (n, 1))  # noqa: E731
+    return Approaches(
+        connector=tile(connector, jnp.int32), lane=tile([0] * len(line), jnp.int32),
+        x=-tile(start, jnp.float32), line=tile(line, jnp.float32), soonest=tile([0] * len(line), jnp.float32),
+        goes_on=tile(goes_on, bool),
+    )  # fmt: skip
+
+
+def test_vehicles_keep_a_junction_clear_that_they_could_not_leave():
+    """Two junctions, the first with two connectors; paths cross until 6 m into its second one.
+
+    With a car of 4.5 m the front has to stop at 25 + 6 + 4.5 = 35.5 m or further on.
+    """
+    _, lane_map = bundled("intersection")
+    cross = jnp.zeros_like(lane_map.conflicts.cross_s).at[1].set(6.0).at[2].set(9.0)
+    lane_map = dataclasses.replace(lane_map, conflicts=dataclasses.replace(lane_map.conflicts, cross_s=cross))
+    none = NO_GAP
+    rows = clear_rows(4, [10.0, 10.0, 35.0], [11.0, 25.0, 36.0], [False, True, False], [0, 1, 2])
+    stop = jnp.array([
+        [none, none, 34.5],  # has to stop for the second junction
+        [none, none, 35.6],  # there would be room
+        [none, none, none],  # behind the first vehicle, which leaves it 30 + 34.5 - 2 m
+        [none, none, none],  # behind the third, which leaves it 62.5 - 28 - 2 m
+    ])  # fmt: skip
+    n = 4
+    state = dataclasses.replace(
+        state_of("highway", [0] * n, [0.0] * n, [8.0] * n, [0] * n), shape=shapes(n, 4.5)
+    )
+    own = Pair(
+        lead=jnp.array([-1, -1, 0, 2], jnp.int32), lead_gap=jnp.array([none, none, 30.0, -28.0]),
+        lag=jnp.full(n, -1), lag_gap=jnp.full(n, none),
+    )  # fmt: skip
+    brake = jnp.full((n, 3), 5.0)
+    found, waits = keeps_clear(lane_map, state, rows, own, brake, stop)
+    np.testing.assert_array_equal(waits, [[False, True, False]] + [[False] * 3] * 2 + [[False, True, False]])
+    np.testing.assert_allclose(found[:, 1], [9.5, none, none, 9.5])
+    # one that cannot stop before it any more goes on
+    assert not keeps_clear(lane_map, state, rows, own, brake * 3, stop)[1].any()
 
 
 def test_circulating_traffic_does_not_brake_hard_for_vehicles_that_are_gone_in_time():
