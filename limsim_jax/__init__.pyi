@@ -95,6 +95,7 @@ from .traffic.ego import Control as Control
 from .traffic.ego import Trajectory as Trajectory
 from .traffic.engine import Command as Command
 from .traffic.engine import Traffic as Traffic
+from .traffic.human import HumanDriver as HumanDriver
 from .traffic.vehicles import Population as Population
 from .traffic.vehicles import default_population as default_population
 from .types import Config as Config

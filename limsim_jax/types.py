@@ -155,6 +155,16 @@ class Outside:
 
 
 @struct.dataclass(frozen=True, kw_only=True)
+class Perception:
+    """What human drivers err in and remember: see `traffic.human`."""
+
+    gap: Float[Array, " N"]  # error of the gap, of variance 1
+    speed: Float[Array, " N"]  # error of the leader's speed, of variance 1
+    noise: Float[Array, " N"]  # random acceleration, of variance 1
+    a: Float[Array, "N H"]  # m/s^2, wanted in the last `H` steps, the latest first
+
+
+@struct.dataclass(frozen=True, kw_only=True)
 class Schedule:
     """Vehicles that enter from outside: sorted by origin, within an origin by time.
 
@@ -247,6 +257,7 @@ class State:
     egos: Egos
     script: Progress | None = None  # None: there is none
     outside: Outside | None = None  # None: there are none
+    perception: Perception | None = None  # None: drivers see all at once
 
 
 @struct.dataclass(frozen=True, kw_only=True)

@@ -52,7 +52,7 @@ NAMES = {
         "Perception",
     ],
     "Step by step": ["Env", "ObserveVector", "ObserveScaled", "RouteReward"],
-    "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "Population", "default_population"],
+    "Calibration": ["calibrate", "IDM", "IIDM", "ACC", "HumanDriver", "Population", "default_population"],
     "Log replay": ["load_scene", "Scene"],
     "Beside other tools": [
         "carla",

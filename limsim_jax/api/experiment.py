@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,7 @@ from limsim_jax.sweeps.experiment import (
     first_fault,
     read_experiments,
 )
+from limsim_jax.traffic.human import HumanDriver
 
 if TYPE_CHECKING:
     from limsim_jax.api.world import World
@@ -101,6 +103,7 @@ class Experiment:
       mix: shares of vehicle classes.
       drivers: a `Population`, or the file of one.
       model: car-following model: "acc", "iidm", "idm", or a value such as `IDM()`.
+      human: reaction time and errors of the drivers: a `HumanDriver`, or True for the usual one.
       lane_changes: whether the traffic changes lanes.
       after_collision: "stop", "continue" or "end".
       success: metric to value or bounds, as `{"contacts": 0, "mean_speed": {"min": 8}}`.
@@ -135,6 +138,7 @@ class Experiment:
         mix: Mapping[str, float] | None = None,
         drivers: Population | str | Path | None = None,
         model: CarFollowing | str | None = None,
+        human: HumanDriver | bool | None = None,
         lane_changes: bool | None = None,
         after_collision: str | None = None,
         success: Mapping[str, Any] | None = None,
@@ -159,6 +163,7 @@ class Experiment:
             "lane_changes": lane_changes, "after_collision": after_collision,
             "drivers": str(drivers) if isinstance(drivers, str | Path) else None,
             "model": model if isinstance(model, str) else None,
+            "human": asdict(human) if isinstance(human, HumanDriver) else human,
         }  # fmt: skip
         given = {key: value for key, value in traffic.items() if value is not None}
         merged = {**dict(table.get("traffic", {})), **given}

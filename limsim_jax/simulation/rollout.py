@@ -27,12 +27,15 @@ from limsim_jax.traffic.collision import collided
 from limsim_jax.traffic.demand import delayed
 from limsim_jax.traffic.ego import with_rows
 from limsim_jax.traffic.engine import Tick, Traffic, drive
+from limsim_jax.traffic.human import first_perception
 from limsim_jax.traffic.script import lanes_now
 from limsim_jax.types import Config, Scenario, Schedule, State
 from limsim_jax.xla import mapped_like
 
 KEPT = 10
 """Decisions whose records a run of any length keeps: the last ones; of fewer, from the first on."""
+
+_DRIVERS = 1  # for the errors of drivers, of all that is drawn from the key of a decision
 
 
 class Result(NamedTuple):
@@ -117,7 +120,9 @@ class Rollout:
         egos = with_rows(state.egos, getattr(self.policy, "others", 0))
         if not self._free:
             egos = replace(egos, free=jnp.zeros_like(egos.free))
-        state = replace(state, egos=egos)
+        human = self.traffic.human
+        memory = None if human is None else first_perception(human, self.config, state.s.shape[0])
+        state = replace(state, egos=egos, perception=memory)
         return self.restart(lane_map, state, sighted(self.policy).init(self.config, lane_map, state))
 
     def restart(self, lane_map: LaneMap, state: State, memory: Any) -> Carry:
@@ -153,8 +158,10 @@ class Rollout:
             lanes = lanes_now(config, lane_map, schedule, state)
             command, memory = policy(config, lanes, state, memory, now)
             after, (kept, records) = drive(
-                config, self.traffic, lanes, state, schedule, command, partial(record, lanes), free=self._free
-            )
+                config, self.traffic, lanes, state, schedule, command, partial(record, lanes),
+                free=self._free,
+                key=None if self.traffic.human is None else jax.random.fold_in(now, _DRIVERS),
+            )  # fmt: skip
             if measure is not None:
                 measured = measure.update(config, lanes, measured, records)
             totals, stood = count(config, totals, stood, state, after)

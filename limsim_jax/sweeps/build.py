@@ -30,6 +30,7 @@ from limsim_jax.sweeps.sumo import with_lights
 from limsim_jax.traffic import car_following
 from limsim_jax.traffic.demand import Demand, EgoStart, Flow, build_demand
 from limsim_jax.traffic.engine import Traffic
+from limsim_jax.traffic.human import HumanDriver
 from limsim_jax.traffic.population_file import read_population
 from limsim_jax.traffic.vehicles import (
     URBAN,
@@ -251,8 +252,13 @@ def plain_demand(
 def traffic_of(experiment: ExperimentFile, model: Any = None) -> Traffic:
     """How the traffic drives; `model` replaces the car-following model of the file."""
     traffic = experiment.traffic
+    try:
+        human = None if traffic.human is None else HumanDriver(**traffic.human.model_dump())
+    except ValueError as error:
+        raise ExperimentError(f"{experiment.name}: traffic.human.{error}") from None
     return Traffic(
         model=MODELS[traffic.model]() if model is None else model,
+        human=human,
         lane_changes=traffic.lane_changes,
         after_collision=traffic.after_collision,
     )

@@ -37,6 +37,7 @@ from limsim_jax.sweeps.script_file import (
 )
 from limsim_jax.sweeps.sumo_files import CONFIG, resolved
 from limsim_jax.traffic.collision import AfterCollision
+from limsim_jax.traffic.human import HumanDriver
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=60)]
 
@@ -78,6 +79,29 @@ class FlowTable(Table):
     """s"""
 
 
+class HumanTable(Table):
+    """Drivers with a reaction time and errors. Absent, they see everything at once and exactly."""
+
+    reaction: NotNegative = HumanDriver.reaction
+    """s; the acceleration follows from what was seen that long ago"""
+    anticipates: bool = HumanDriver.anticipates
+    """A driver counts on its own acceleration and on an even speed of its leader meanwhile."""
+    vehicles_ahead: Annotated[int, Field(ge=1)] = HumanDriver.vehicles_ahead
+    """Vehicles that a driver looks at."""
+    gap_error: NotNegative = HumanDriver.gap_error
+    """Relative standard deviation of the gap that a driver sees."""
+    approach_error: NotNegative = HumanDriver.approach_error
+    """1/s; standard deviation of the leader's speed that a driver sees, per metre of gap"""
+    error_time: Positive = HumanDriver.error_time
+    """s; for how long errors last"""
+    noise: NotNegative = HumanDriver.noise
+    """m^2/s^3; intensity of a random acceleration"""
+
+
+def _with_defaults(found: Any) -> Any:
+    return {True: {}, False: None}[found] if isinstance(found, bool) else found
+
+
 class TrafficTable(Table):
     """All vehicles but the egos."""
 
@@ -97,6 +121,8 @@ class TrafficTable(Table):
     drivers: str | None = None
     """A file of drivers that `limsim-jax calibrate` wrote, seen from the experiment file."""
     model: Literal["idm", "iidm", "acc"] = "acc"
+    human: Annotated[HumanTable | None, BeforeValidator(_with_defaults)] = None
+    """Reaction time and errors of all drivers on lanes; `true` for the usual ones."""
     lane_changes: bool = True
     after_collision: AfterCollision = "stop"
 

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, curvature, room_beside
 from limsim_jax.maps.routing import NO_ROOM
@@ -37,6 +37,7 @@ from limsim_jax.traffic.ego import (
     track,
     with_free,
 )
+from limsim_jax.traffic.human import HumanDriver, human_accelerations, perceive, vehicles_beyond
 from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, side_to_look, start
 from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes, creep_speed, without
 from limsim_jax.traffic.neighbors import (
@@ -80,6 +81,7 @@ class Traffic:
     look_for_contacts: Literal["step", "decision"] = "step"  # how often bodies are compared
     limits: Limits = field(default_factory=Limits)  # of free egos
     player: Player | None = None  # moves vehicles from outside, `State.outside`
+    human: HumanDriver | None = None  # reaction time, errors and anticipation
 
 
 class Tick(NamedTuple):
@@ -195,6 +197,7 @@ def decide(
         ahead=distance,
         courtesy=choice.courtesy,
         lanes=ahead.lane,
+        beyond=None if traffic.human is None else vehicles_beyond(traffic.human, state, own, ahead.lane),
     )
 
 
@@ -362,6 +365,7 @@ def drive(
     record: Callable[[Tick], Any] | None = None,
     *,
     free: bool = True,
+    key: Key[Array, ""] | None = None,
 ) -> tuple[State, Any]:
     """Simulate one decision and the physics steps up to the next.
 
@@ -374,17 +378,23 @@ def drive(
       command: of the egos.
       record: its results are stacked over the steps, `[decision_every, ...]`.
       free: egos may leave their lanes; False is for worlds without free egos, and compiles faster.
+      key: of this decision, for the errors of human drivers.
 
     Returns:
       The state before the next decision, and the records.
 
     Raises:
-      ValueError: an unknown `after_collision` or `look_for_contacts`.
+      ValueError: an unknown `after_collision` or `look_for_contacts`, or human drivers that err without
+        a key.
     """
     if traffic.look_for_contacts not in ("step", "decision"):
         raise ValueError(
             f"look_for_contacts = '{traffic.look_for_contacts}': unknown; known are step, decision"
         )
+    if traffic.human is not None:
+        if traffic.human.errs and key is None:
+            raise ValueError("human drivers err at random: `drive` needs a key")
+        state = state if key is None else perceive(traffic.human, config, state, key)
     command = Command() if command is None else command
     if command.slot is not None:
         state = assign(lane_map, state, boxes(lane_map, state), command.slot)
@@ -461,11 +471,11 @@ def _step(
     egos, before = state.egos, state
     outside = None if traffic.player is None else traffic.player(config, told, state)
     if actions is None:
-        a = accelerations(traffic.model, state, decision, x)
+        state, a = _follow(config, traffic, state, decision, x)
     else:
         state = begin(config, lane_map, actions, state)
         orders = speed_orders(config, actions, state)
-        a = accelerations(traffic.model, state, without_speed(orders, decision), x)
+        state, a = _follow(config, traffic, state, without_speed(orders, decision), x)
         a = accelerate(config, orders, state, a)
     if command.meta is not None:
         told = meta_acceleration(jnp.maximum(command.meta, 0), state, a)
@@ -508,6 +518,16 @@ def _step(
         return state, dx, left, None, None
     state, off = record_events(config, lane_map, state, box, free=may_be_free)
     return state, dx, left, box, off
+
+
+def _follow(
+    config: Config, traffic: Traffic, state: State, decision: Decision, x: Float[Array, " N"]
+) -> tuple[State, Float[Array, " N"]]:
+    """Accelerations (m/s^2) of all vehicles by the car-following model, and the state with what they saw."""
+    if traffic.human is None:
+        return state, accelerations(traffic.model, state, decision, x)
+    a, perception = human_accelerations(traffic.human, config, traffic.model, state, decision, x)
+    return replace(state, perception=perception), a
 
 
 def _control(

@@ -40,6 +40,16 @@ class Decision(NamedTuple):
     ahead: Float[Array, " N"]  # m to there, at the decision
     courtesy: Obstacles  # the vehicle that is let in, and the one behind which a gap is looked for
     lanes: Int[Array, "N D"]  # the lanes that it drives on next, its own first
+    beyond: Obstacles | None = None  # vehicles ahead of the leader; None: no driver looks so far
+
+
+class Seen(NamedTuple):
+    """Obstacles `K` of every vehicle as they are now; vehicles last: XLA vectorises along their axis."""
+
+    moving: Bool[Array, "K N"]  # a vehicle, not a place to stop
+    gap: Float[Array, "K N"]  # m; NO_GAP where there is none
+    v_lead: Float[Array, "K N"]  # m/s
+    a_lead: Float[Array, "K N"]  # m/s^2
 
 
 @jax.named_scope("accelerations")
@@ -54,36 +64,70 @@ def accelerations(
       decision: the last one.
       x: m travelled since then.
     """
-    driver = state.driver
-    index, gap0 = (x.T for x in decision.obstacles)  # vehicles last: XLA vectorises along their axis
-    moving = index >= 0
-
-    def seen(index: Int[Array, "*b"], value: Float[Array, " N"]) -> Float[Array, "*b"]:
-        return jnp.where(index >= 0, value[index], 0)
-
-    none = (gap0 >= NO_GAP) | (moving & ~state.active[index])  # a vehicle that leaves the map is no obstacle
-    gap = jnp.where(none, NO_GAP, gap0 + seen(index, x) - x[None])
-    v_lead = jnp.where(none, state.v[None], seen(index, state.v))
-    a_lead = jnp.where(moving, seen(index, state.a), 0)
-    gap, v_lead, a_lead = computed_once((gap, v_lead, a_lead))
-    # the speed from which `v_ahead` is reached with a share of b
-    room = jnp.maximum(decision.ahead - x, 0)
-    reach = jnp.sqrt(decision.v_ahead**2 + 2 * DRIVING.bend_braking * driver.b * room + 1e-6)
-    v0 = jnp.minimum(decision.v0, reach)
-    each, v, v_free = jax.tree.map(lambda value: value[None], (driver, state.v, v0))
+    moving, gap, v_lead, a_lead = seen(state, decision.obstacles, x)
+    v0 = desired(state, decision, x)
+    each, v, v_free = jax.tree.map(lambda value: value[None], (state.driver, state.v, v0))
     a = column_min(model(each, gap=gap, v=v, v_lead=v_lead, a_lead=a_lead, v0=v_free))
+    return attentive(model, state, decision, x, a, jnp.where(moving, NO_GAP, gap))
+
+
+def seen(state: State, obstacles: Obstacles, x: Float[Array, " N"]) -> Seen:
+    """Obstacles of a decision, now that vehicles have travelled `x` m."""
+    index, gap0 = (x.T for x in obstacles)
+    moving = index >= 0
+    none = (gap0 >= NO_GAP) | (moving & ~state.active[index])  # a vehicle that leaves the map is no obstacle
+    gap = jnp.where(none, NO_GAP, gap0 + jnp.where(moving, x[index], 0) - x[None])
+    v_lead = jnp.where(none, state.v[None], jnp.where(moving, state.v[index], 0))
+    a_lead = jnp.where(moving, state.a[index], 0)
+    return Seen(moving, *computed_once((gap, v_lead, a_lead)))
+
+
+def desired(state: State, decision: Decision, x: Float[Array, " N"]) -> Float[Array, " N"]:
+    """Desired speed (m/s) from which lower speeds ahead are reached with a share of b."""
+    return jnp.minimum(decision.v0, _in_time(state, decision, x))
+
+
+def _in_time(state: State, decision: Decision, x: Float[Array, " N"]) -> Float[Array, " N"]:
+    room = jnp.maximum(decision.ahead - x, 0)
+    return jnp.sqrt(decision.v_ahead**2 + 2 * DRIVING.bend_braking * state.driver.b * room + 1e-6)
+
+
+def attentive(
+    model: CarFollowing,
+    state: State,
+    decision: Decision,
+    x: Float[Array, " N"],
+    a: Float[Array, " N"],
+    line: Float[Array, "K N"],
+) -> Float[Array, " N"]:
+    """Acceleration (m/s^2) with all that vehicles mind apart from obstacles.
+
+    These are bends and limits ahead, lines to stop at, and vehicles that are let in.
+
+    Args:
+      model: car following.
+      state: the world.
+      decision: the last one.
+      x: m travelled since then.
+      a: acceleration for the obstacles.
+      line: m to places to stop; NO_GAP for none.
+    """
+    driver, reach = state.driver, _in_time(state, decision, x)
+    room = jnp.maximum(decision.ahead - x, 0)
     # the models lag behind a desired speed that falls: a vehicle above it brakes as hard as that takes
     need = (state.v * state.v - decision.v_ahead**2) / (2 * jnp.maximum(room, 0.5))
     a = jnp.where(state.v > reach, jnp.minimum(a, -jnp.clip(need, 0, driver.b)), a)
     # the models roll on slowly within s0: a vehicle that comes to stand at a line stops before it
-    line = jnp.where(index < 0, gap, NO_GAP).min(0) - driver.s0 + DRIVING.line_room
-    need = state.v * state.v / (2 * jnp.maximum(line, 0.02))
-    rolls = (state.v < DRIVING.walking_speed) & (line < DRIVING.line_near) & (need > DRIVING.line_braking)
+    near = line.min(0) - driver.s0 + DRIVING.line_room
+    need = state.v * state.v / (2 * jnp.maximum(near, 0.02))
+    rolls = (state.v < DRIVING.walking_speed) & (near < DRIVING.line_near) & (need > DRIVING.line_braking)
     a = jnp.where(rolls, jnp.minimum(a, -jnp.minimum(need, DRIVING.line_hardest)), a)
     index, gap0 = (x.T for x in decision.courtesy)
     minds = (index >= 0) & state.active[index]
-    gap = jnp.where(minds, gap0 + seen(index, x) - x[None], NO_GAP)
-    v_lead = jnp.where(minds, seen(index, state.v), state.v[None])
+    gap = jnp.where(minds, gap0 + jnp.where(index >= 0, x[index], 0) - x[None], NO_GAP)
+    v_lead = jnp.where(minds, state.v[index], state.v[None])
+    v0 = jnp.minimum(decision.v0, reach)
+    each, v, v_free = jax.tree.map(lambda value: value[None], (driver, state.v, v0))
     kind = column_min(model(each, gap=gap, v=v, v_lead=v_lead, a_lead=jnp.zeros_like(gap), v0=v_free))
     return jnp.minimum(a, jnp.maximum(kind, -LANE_CHANGES.courtesy_braking))
 

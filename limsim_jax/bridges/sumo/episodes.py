@@ -134,6 +134,8 @@ class SumoEpisodes:
         self.egos = takeover.egos
         if experiment.slots <= self.egos:
             self._refuse("slots", f"{experiment.slots}, but there are {self.egos} egos and their traffic")
+        if experiment.traffic.human is not None:
+            self._refuse("traffic.human", "the traffic belongs to SUMO")
         if getattr(self._policy, "others", 0):
             self._refuse("policy", "it drives other vehicles as well; those belong to SUMO")
         self._town: Map = map_of(experiment)
