@@ -112,7 +112,7 @@ def drive_ring(
     seconds: float,
     seed: int = 0,
 ) -> Run:
-    """Drive cars from places `x` (m, ascending) at speeds `v` (m/s) round a ring."""
+    """Drive cars round a ring from places (m, ascending) and speeds (m/s)."""
     network, lane_map = around
     half, n = float(lane_map.length[0]), len(x)
     population = uniform_population("car", a_lat=50.0, **driver)
@@ -125,7 +125,11 @@ def drive_ring(
     )  # fmt: skip
 
     def kept(_: LaneMap) -> Callable[[Any], Any]:
-        return lambda tick: (tick.state.v, tick.state.lane * half + tick.state.s, tick.state.status[:])
+        return lambda tick: (
+            tick.state.v,
+            tick.state.lane.astype(jnp.float32) * half + tick.state.s,
+            tick.state.status,
+        )
 
     run = Rollout(Config(dt=DT), traffic, seconds, record=kept)
     trace = jax.jit(
@@ -140,7 +144,7 @@ def drive_ring(
 
 
 def stop_and_go(human: HumanDriver | None, minutes: float, seed: int) -> tuple[dict[str, float], Run]:
-    """What becomes of an even flow; the drivers are the default ones."""
+    """How an even flow of default drivers goes on."""
     x = np.arange(CARS) * RING / CARS
     run = drive_ring(ring(RING, LIMIT), Traffic(human=human), {}, x, np.full(CARS, 3.5), 60 * minutes, seed)
     stood = (run.v < STANDS).any(1)
@@ -156,7 +160,7 @@ def stop_and_go(human: HumanDriver | None, minutes: float, seed: int) -> tuple[d
 
 
 def wave_speed(v: NDArray[np.float64], place: NDArray[np.float64]) -> float:
-    """Speed (m/s) of the fronts at which cars move off, NaN without any.
+    """Speed (m/s) of the fronts where cars move off, NaN without any.
 
     Of speeds (m/s) and places (m) `[T, N]`, each car behind the next.
     """
@@ -179,9 +183,9 @@ def wave_speed(v: NDArray[np.float64], place: NDArray[np.float64]) -> float:
 
 
 def slopes(driver: Driver, s: float, v: float, v0: float, human: HumanDriver | None) -> list[NDArray[Any]]:
-    """Derivatives of the IDM's acceleration by gap, own speed and leader's speed, for each vehicle ahead.
+    """Derivatives of the IDM by gap, own speed and leader's speed.
 
-    Those by the own speed belong to all together and stand with the first.
+    For each vehicle ahead. Those by the own speed belong to all together and stand with the first.
     """
     n = 1 if human is None else human.vehicles_ahead
     root = math.sqrt(sum(1 / m**2 for m in range(1, n + 1)))
@@ -189,7 +193,7 @@ def slopes(driver: Driver, s: float, v: float, v0: float, human: HumanDriver | N
 
     def total(gaps: Array, own: Array, leaders: Array) -> Array:
         def model(gap: Array, lead: Array) -> Array:
-            return IDM()(close, gap=gap, v=own, v_lead=lead, a_lead=jnp.zeros_like(gap), v0=v0)
+            return IDM()(close, gap=gap, v=own, v_lead=lead, a_lead=jnp.zeros_like(gap), v0=jnp.float32(v0))
 
         free = model(jnp.full_like(own, NO_GAP), own)
         return free + sum(model(gaps[m], leaders[m]) - free for m in range(n))
@@ -199,8 +203,9 @@ def slopes(driver: Driver, s: float, v: float, v0: float, human: HumanDriver | N
 
 
 def growth(derivatives: list[NDArray[Any]], human: HumanDriver | None, kappa: float) -> tuple[float, complex]:
-    """Growth rate (1/s) of a wave with phase `kappa` (rad) from vehicle to vehicle, and speed over place.
+    """Growth rate (1/s) of a wave, and speed over place.
 
+    The phase is `kappa` (rad) from vehicle to vehicle.
     `derivatives` are those of `slopes`. With a delay there are many such waves; this is the fastest. Each
     vehicle accelerates evenly for a step: with z the growth of a step, V = A dt / (z - 1) and
     Y = dt (V + A dt / 2) / (z - 1). The acceleration is z^(-T'/dt) times what the driver wants.
@@ -226,7 +231,8 @@ def growth(derivatives: list[NDArray[Any]], human: HumanDriver | None, kappa: fl
     turn = np.exp(1j * kappa * np.arange(1, len(f_s) + 1))
     b, c = f_v + f_l @ turn, f_s @ (turn - 1)
     known = (b + np.array([1, -1]) * np.sqrt(b * b + 4 * c)) / 2  # without delay
-    z = np.exp(np.append((real + 1j * imaginary).ravel(), known) * DT)
+    z: NDArray[np.complex128] = np.exp(np.append((real + 1j * imaginary).ravel(), known) * DT)
+    change = np.zeros_like(z)
     with np.errstate(all="ignore"):
         for _ in range(60):  # Newton
             h = 1e-3 * (z - 1)
@@ -238,7 +244,7 @@ def growth(derivatives: list[NDArray[Any]], human: HumanDriver | None, kappa: fl
 
 
 def wave(human: HumanDriver | None, v: float, cars: int = 40, seconds: float = 60.0) -> dict[str, float]:
-    """Growth rate (1/s) of the wave that grows fastest, by theory and driven, and its length in vehicles.
+    """The wave that grows fastest: its length, and growth rate (1/s) by theory and driven.
 
     The drivers follow the IDM. The rate counts after 5 s, as long as the wave is small.
     """
@@ -255,7 +261,7 @@ def wave(human: HumanDriver | None, v: float, cars: int = 40, seconds: float = 6
     model: CarFollowing = IDM()
     run = drive_ring(
         ring(way, v0), Traffic(model=model, human=human), values | {"length": length}, x,
-        v + (speed_over_place * pattern).real, seconds,
+        np.asarray(v + (speed_over_place * pattern).real, np.float64), seconds,
     )  # fmt: skip
     size = np.abs((run.v * np.exp(-1j * kappa * np.arange(cars))).mean(1))
     t = DT * np.arange(1, len(size) + 1)
@@ -276,7 +282,7 @@ def draw(runs: dict[str, Run]) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 3.4), layout="constrained")
-    axes = figure.subplots(1, len(runs), sharey=True)
+    axes, lines = figure.subplots(1, len(runs), sharey=True), None
     for ax, (name, run) in zip(np.atleast_1d(axes), runs.items(), strict=True):
         every = 5
         t = DT * every * np.arange(len(run.v[::every]))
@@ -290,6 +296,7 @@ def draw(runs: dict[str, Run]) -> None:
             ax.add_collection(lines)
         ax.set(xlim=(0, 300), ylim=(0, RING), title=name, xlabel="time, s")
     np.atleast_1d(axes)[0].set_ylabel("place on the ring, m")
+    assert lines is not None
     figure.colorbar(lines, ax=axes, label="speed, m/s")
     figure.savefig(PICTURE, dpi=110)
 

@@ -398,6 +398,7 @@ def _fields_at(where: tuple[Any, ...]) -> list[str]:
         ("ego",): EgoTable,
         ("traffic",): TrafficTable,
         ("traffic", "flow"): FlowTable,
+        ("traffic", "human"): HumanTable,
         ("vehicle",): VehicleTable,
         ("vehicle", "action"): ActionTable,
         ("obstacle",): ObstacleTable,

@@ -523,7 +523,7 @@ def _step(
 def _follow(
     config: Config, traffic: Traffic, state: State, decision: Decision, x: Float[Array, " N"]
 ) -> tuple[State, Float[Array, " N"]]:
-    """Accelerations (m/s^2) of all vehicles by the car-following model, and the state with what they saw."""
+    """Follow: the state with what drivers saw, and accelerations (m/s^2)."""
     if traffic.human is None:
         return state, accelerations(traffic.model, state, decision, x)
     a, perception = human_accelerations(traffic.human, config, traffic.model, state, decision, x)

@@ -98,7 +98,7 @@ def perceive(human: HumanDriver, config: Config, state: State, key: Key[Array, "
 
 
 def vehicles_beyond(human: HumanDriver, state: State, own: Pair, lanes: Array) -> Obstacles | None:
-    """Vehicles ahead of the leader, `vehicles_ahead` - 1 of them, by the gaps between.
+    """Vehicles ahead of the leader, with the sum of the gaps between.
 
     A vehicle that leaves the way of the driver, or whose leader does, ends the look ahead.
 
@@ -164,7 +164,9 @@ def human_accelerations(
         return model(drivers, **situation._asdict(), v0=v_free)
 
     gap = jnp.where(found.moving, found.gap, NO_GAP)
-    followed = _Situation(gap, state.v[None], jnp.where(found.moving, found.v_lead, state.v), found.a_lead)
+    followed = _Situation(
+        gap, state.v[None], jnp.where(found.moving, found.v_lead, state.v[None]), found.a_lead
+    )
     followed = _taken_for(human, state, followed)
     if decision.beyond is None:
         wish = column_min(least(driver, followed))
@@ -175,7 +177,10 @@ def human_accelerations(
         )
         wish = _together(least, driver, followed, further)
     line = jnp.where(found.moving, NO_GAP, found.gap)
-    stops = column_min(least(driver, _Situation(line, state.v[None], state.v[None], jnp.zeros_like(line))))
+    place = _Situation(
+        line, state.v[None], jnp.where(found.moving, state.v[None], found.v_lead), found.a_lead
+    )
+    stops = column_min(least(driver, place))
     memory, late = _late(human, config, state, wish)
     if human.noise:
         late += jnp.where(state.v > _ROLLS, math.sqrt(human.noise / config.decision_time) * memory.noise, 0)
@@ -184,15 +189,15 @@ def human_accelerations(
 
 
 def _taken_for(human: HumanDriver, state: State, true: _Situation) -> _Situation:
-    """A situation with errors, as it is expected at the end of the reaction time."""
+    """A situation with errors, as expected after the reaction time."""
     gap, v, v_lead, a_lead = true
     there, memory = gap < NO_GAP, _memory(state)
     if human.approach_error:
-        v_lead = jnp.where(there, v_lead + gap * human.approach_error * memory.speed, v)
+        v_lead = jnp.where(there, v_lead + gap * human.approach_error * memory.speed[None], v)
     if human.gap_error:
-        gap = jnp.where(there, gap * jnp.exp(human.gap_error * memory.gap), NO_GAP)
+        gap = jnp.where(there, gap * jnp.exp(human.gap_error * memory.gap[None]), NO_GAP)
     if human.anticipates:
-        change = human.reaction * state.a
+        change = human.reaction * state.a[None]
         gap = jnp.where(there, gap + human.reaction * (v_lead - v), NO_GAP)
         v_lead, v = jnp.maximum(v_lead + change, 0), jnp.maximum(v + change, 0)
     return _Situation(gap, v, jnp.maximum(v_lead, 0), a_lead)
@@ -220,7 +225,7 @@ def _together(
 def _late(
     human: HumanDriver, config: Config, state: State, wish: Float[Array, " N"]
 ) -> tuple[Perception, Float[Array, " N"]]:
-    """What drivers remember, and the acceleration (m/s^2) that they wanted a reaction time ago.
+    """What drivers remember, and what they wanted a reaction time ago (m/s^2).
 
     A vehicle that has just entered has no past: it drives as it wants to now.
     """

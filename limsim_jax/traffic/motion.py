@@ -83,7 +83,7 @@ def seen(state: State, obstacles: Obstacles, x: Float[Array, " N"]) -> Seen:
 
 
 def desired(state: State, decision: Decision, x: Float[Array, " N"]) -> Float[Array, " N"]:
-    """Desired speed (m/s) from which lower speeds ahead are reached with a share of b."""
+    """Desired speed (m/s): lower speeds ahead are reached with a share of b."""
     return jnp.minimum(decision.v0, _in_time(state, decision, x))
 
 

@@ -3,6 +3,7 @@
 import pytest
 
 import limsim_jax as lj
+from limsim_jax.sweeps.build import traffic_of
 from limsim_jax.sweeps.identity import describe
 
 
@@ -15,6 +16,16 @@ def test_keywords_replace_fields_of_a_file():
         5,
     )
     assert drive.file.traffic.flow == lj.Experiment("roundabout").file.traffic.flow
+
+
+def test_human_drivers_are_asked_for_in_a_word_or_by_their_numbers():
+    calm = lj.HumanDriver(reaction=0.4, vehicles_ahead=3)
+    for given, expected in (
+        (None, None), (False, None), (True, lj.HumanDriver()), (calm, calm),
+    ):  # fmt: skip
+        assert traffic_of(lj.Experiment("roundabout", human=given).file).human == expected
+    keeps = lj.Experiment(lj.Experiment("roundabout", human=calm).file, horizon=9)
+    assert traffic_of(keeps.file).human == calm
 
 
 def test_plain_traffic_has_no_ego():

@@ -170,6 +170,16 @@ WRONG = {  # what to replace, by what, and the message
         "vehicles = 6\ndensity = 2.0",
         "vehicles or density",
     ),
+    "no such number of human drivers": (
+        "vehicles = 6",
+        "vehicles = 6\nhuman = { delay = 0.5 }",
+        "traffic.human.delay: no such field; known are reaction",
+    ),
+    "a reaction time of minutes": (
+        "vehicles = 6",
+        "vehicles = 6\nhuman = { reaction = 60.0 }",
+        "traffic.human.reaction = 60.0: must be 0 to 5.0",
+    ),
     "no TOML": ("slots = 32", "slots = = 32", "not valid TOML"),
 }
 

@@ -93,9 +93,10 @@ def keeps_clear(
     brake: Float[Array, "N R"],
     stop: Float[Array, "N R"],
 ) -> tuple[Float[Array, "N R"], Bool[Array, "N R"]]:
-    """Wait before a junction if the next stop leaves the tail where other paths cross.
+    """Keep clear: no vehicle stops with its tail where other paths cross.
 
-    That is the stop for a junction further on, or behind a leader that has to stop for one.
+    It waits before the junction if it will have to stop beyond it without enough room: for the next junction,
+    or behind a leader that has to stop.
 
     Args:
       lane_map: where.
@@ -111,6 +112,7 @@ def keeps_clear(
     clear = lane_map.conflicts.cross_s[approaches.connector]
     needed = clear - approaches.x + state.shape.length[:, None]
     comes = first = stop.min(-1)
+    behind = jnp.full_like(first, NO_GAP)
     for _ in range(_LEADERS):
         behind = jnp.where(own.lead >= 0, own.lead_gap + comes[own.lead] - state.driver.s0, NO_GAP)
         comes = jnp.minimum(first, behind)
