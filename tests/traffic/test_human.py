@@ -129,6 +129,7 @@ def test_a_vehicle_that_has_just_entered_does_not_drive_by_the_past_of_its_slot(
     late, memory = human_accelerations(HumanDriver(), CONFIG, IDM(), state, decision, x)
     new = np.array([False, True, False, True])
     np.testing.assert_allclose(late[new], np.asarray(memory.a)[new, 0], atol=1e-6)
+    assert state.perception is not None
     np.testing.assert_allclose(late[~new], np.asarray(state.perception.a)[~new, 6], atol=1e-6)
 
 
@@ -155,6 +156,7 @@ def test_errors_are_ornstein_uhlenbeck_processes():
 
     def go_on(state, k):
         state = perceive(human, CONFIG, state, jax.random.fold_in(jax.random.key(4), k))
+        assert state.perception is not None
         return dataclasses.replace(state, step=state.step + 5), (state.perception.gap, state.perception.speed)
 
     gap, speed = (np.asarray(x) for x in jax.lax.scan(go_on, state, jnp.arange(steps))[1])
@@ -174,6 +176,7 @@ def test_vehicles_beyond_the_leader_end_where_ways_part():
     )  # fmt: skip
     lanes = jnp.array([[0, 1], [0, 1], [1, 2], [2, 3]])
     found = vehicles_beyond(HumanDriver(vehicles_ahead=4), state, own, lanes)
+    assert found is not None and vehicles_beyond(HumanDriver(), state, own, lanes) is None
     np.testing.assert_array_equal(found.other[0], [2, -1, -1])  # 3 is on a lane that 0 does not come to
     np.testing.assert_allclose(found.gap[0], [35.0, NO_GAP, NO_GAP])
     np.testing.assert_array_equal(found.other[1], [-1, -1, -1])
