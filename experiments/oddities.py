@@ -1,4 +1,4 @@
-"""Oddities of the traffic, counted: jumps, slides, hard braking, idle stops.
+"""Oddities of the traffic, counted: jumps, slides, jerks, hard braking, idle stops, changes of mind.
 
     python experiments/oddities.py [--worlds 12] [--map NAME_OR_FILE ...]
 
@@ -10,7 +10,9 @@ each kind are; look at them with `limsim-jax run MAP --seed N --video FILE` and 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import math
 from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import NDArray
 from soundness import HORIZON, INITIAL, OTHER_RATE, RATES, RESULTS, SLOTS, check_maps
 
 from limsim_jax.files import write_whole
@@ -36,6 +39,10 @@ KINDS = {
     "jumps": "a body moves 0.25 m more or less than its speed tells",
     "slides": "a body moves 0.25 rad off its heading",
     "hard": "begins to brake with more than 5 m/s^2",
+    "turns": "turns by 0.5 degrees in a step below 0.2 m/s",
+    "jerks": "the acceleration changes by more than 15 m/s^3, not by coming to a stand",
+    "changes": "begins to change lanes",
+    "reversed": "begins to change back within 15 s",
     "stands": "stands for 10 s without a line, a vehicle within 10 m ahead, or another right of way",
 }
 SHOWN = 3
@@ -51,6 +58,7 @@ class Seen(NamedTuple):
     s: Float[Array, " N"]
     v: Float[Array, " N"]
     a: Float[Array, " N"]
+    side: Int[Array, " N"]
     yielding: Bool[Array, " N"]
 
 
@@ -60,7 +68,7 @@ def odd(lane_map: LaneMap, seen: Seen) -> dict[str, Bool[np.ndarray, "T N"]]:
     same = seen.active[1:] & seen.active[:-1] & (seen.vehicle[1:] == seen.vehicle[:-1])
     dx, dy = (np.diff(box[..., k], axis=0) for k in range(2))
     moved = np.hypot(dx, dy)
-    off = np.abs(np.angle(np.exp(1j * (np.arctan2(dy, dx) - box[1:, :, 2]))))
+    off = np.abs(_wrapped(np.arctan2(dy, dx) - box[1:, :, 2]))
     standing = np.zeros(v.shape, bool)
     still = np.zeros(v.shape[1], int)
     to_line = np.asarray(lane_map.stop_s)[seen.lane] - seen.s
@@ -77,11 +85,29 @@ def odd(lane_map: LaneMap, seen: Seen) -> dict[str, Bool[np.ndarray, "T N"]]:
         "jumps": same & (np.abs(moved - DT * (v[1:] + v[:-1]) / 2) > 0.25),
         "slides": same & (moved > 0.15) & (off > 0.25),
         "hard": same & (seen.a[1:] < -5),
+        "turns": same & (v[1:] < 0.2) & (np.abs(_wrapped(np.diff(box[..., 2], axis=0))) > math.radians(0.5)),
+        "jerks": same & (np.abs(np.diff(seen.a, axis=0)) > 15 * DT) & (v[1:] > 0),
+        "changes": same & (seen.side[1:] != 0) & (seen.side[:-1] == 0),
     }
     first = {k: np.concatenate([x[:1], x[1:] & ~x[:-1]]) for k, x in happens.items()}
-    return {k: np.concatenate([np.zeros((1, v.shape[1]), bool), x]) for k, x in first.items()} | {
-        "stands": standing
-    }
+    found = {k: np.concatenate([np.zeros((1, v.shape[1]), bool), x]) for k, x in first.items()}
+    return found | {"stands": standing, "reversed": _reversed(seen, found["changes"])}
+
+
+def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.angle(np.exp(1j * angle))
+
+
+def _reversed(seen: Seen, begins: Bool[np.ndarray, "T N"]) -> Bool[np.ndarray, "T N"]:
+    """Lane changes that begin within 15 s after one to the other side."""
+    found = np.zeros_like(begins)
+    for n in range(begins.shape[1]):
+        times = np.flatnonzero(begins[:, n])
+        for one, two in itertools.pairwise(times):
+            same = seen.vehicle[one, n] == seen.vehicle[two, n] and seen.active[one:two, n].all()
+            back = seen.side[one, n] == -seen.side[two, n]
+            found[two, n] = same and back and two - one <= round(15 / DT)
+    return found
 
 
 def watch(name: str, worlds: int) -> dict[str, Any]:
@@ -97,7 +123,7 @@ def watch(name: str, worlds: int) -> dict[str, Any]:
     def recorder(lane_map: LaneMap) -> Any:
         def record(tick: Tick) -> Seen:
             x = tick.state
-            return Seen(boxes(lane_map, x), x.active, x.vehicle, x.lane, x.s, x.v, x.a, x.yielding)
+            return Seen(boxes(lane_map, x), x.active, x.vehicle, x.lane, x.s, x.v, x.a, x.side, x.yielding)
 
         return record
 
@@ -113,7 +139,7 @@ def watch(name: str, worlds: int) -> dict[str, Any]:
         for kind, where in odd(lane_map, seen).items():
             for t, n in np.argwhere(where):
                 counts[kind] += 1
-                if counts[kind] <= SHOWN:
+                if kind != "changes" and counts[kind] <= SHOWN:
                     place = f"{lanes[seen.lane[t, n]]} at {seen.s[t, n]:.1f} m, {seen.v[t, n]:.1f} m/s"
                     print(f"{name} seed {seed} {(t + 1) * DT:.1f} s slot {n}: {kind} on {place}", flush=True)
     return {"map": Path(name).stem, "worlds": worlds, "vehicle_km": round(km, 1)} | counts
@@ -121,13 +147,14 @@ def watch(name: str, worlds: int) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
-    lines = [
-        "| map | worlds | vehicle-km | " + " | ".join(KINDS) + " |",
-        "|---|" + "---:|" * (2 + len(KINDS)),
-    ]
+    counted = [kind for kind in KINDS if kind not in ("jerks", "changes", "reversed")]
+    names = ["map", "worlds", "vehicle-km", *counted, "jerks per km", "lane changes per km", "reversed"]
+    lines = ["| " + " | ".join(names) + " |", "|---|" + "---:|" * (len(names) - 1)]
     for r in rows:
-        counts = " | ".join(str(r[kind]) for kind in KINDS)
-        lines.append(f"| {r['map']} | {r['worlds']} | {r['vehicle_km']:,.0f} | {counts} |")
+        km, share = r["vehicle_km"], r["reversed"] / max(r["changes"], 1)
+        cells = [r["map"], r["worlds"], f"{km:,.0f}", *(r[kind] for kind in counted)]
+        cells += [f"{r['jerks'] / km:.2f}", f"{r['changes'] / km:.2f}", f"{share:.1%}".replace("%", " %")]
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join([*lines, "", *(f"- {kind}: {what}" for kind, what in KINDS.items())])
 
 
