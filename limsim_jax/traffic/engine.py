@@ -39,7 +39,7 @@ from limsim_jax.traffic.ego import (
 )
 from limsim_jax.traffic.human import HumanDriver, human_accelerations, perceive, vehicles_beyond
 from limsim_jax.traffic.lane_change import LaneChoice, choose_lane, place_beside, side_to_look, start
-from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes, creep_speed, without
+from limsim_jax.traffic.motion import Decision, accelerations, advance, boxes, creep_speed, smooth, without
 from limsim_jax.traffic.neighbors import (
     Ahead,
     Obstacles,
@@ -525,9 +525,9 @@ def _follow(
 ) -> tuple[State, Float[Array, " N"]]:
     """Follow: the state with what drivers saw, and accelerations (m/s^2)."""
     if traffic.human is None:
-        return state, accelerations(traffic.model, state, decision, x)
+        return state, smooth(config, state, accelerations(traffic.model, state, decision, x))
     a, perception = human_accelerations(traffic.human, config, traffic.model, state, decision, x)
-    return replace(state, perception=perception), a
+    return replace(state, perception=perception), smooth(config, state, a)
 
 
 def _control(

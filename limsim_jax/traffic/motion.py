@@ -132,6 +132,17 @@ def attentive(
     return jnp.minimum(a, jnp.maximum(kind, -LANE_CHANGES.courtesy_braking))
 
 
+def smooth(config: Config, state: State, a: Float[Array, " N"]) -> Float[Array, " N"]:
+    """Acceleration (m/s^2) that changes no faster than pedals do.
+
+    A vehicle that has to brake hard does so at once, and one that has just entered drives as it wants.
+    """
+    most = DRIVING.jerk * config.dt
+    limited = jnp.clip(a, state.a - most, state.a + most)
+    at_once = (a < -DRIVING.emergency) | (config.time(state.step) - state.entered < config.dt / 2)
+    return jnp.where(at_once, a, limited)
+
+
 @jax.named_scope("advance")
 def advance(
     config: Config,

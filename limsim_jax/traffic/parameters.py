@@ -511,6 +511,20 @@ class Driving:
         (0.1, 2.0),
     )
     line_hardest: float = _number(2.5, "m/s^2", "braking at most in such a stop", "chosen", (1.0, 5.0))
+    jerk: float = _number(
+        12.65,
+        "m/s^3",
+        "how fast a driver changes its acceleration",
+        "UN Regulation 157, guidance on performance models: 0.774 g built up within 0.6 s",
+        (2.0, 1000.0),
+    )
+    emergency: float = _number(
+        6.0,
+        "m/s^2",
+        "braking that begins at once",
+        "chosen: nothing but an emergency asks for more",
+        (0.0, 10.0),
+    )
     patience: float = _number(
         20.0,
         "s",
