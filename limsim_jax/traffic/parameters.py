@@ -350,7 +350,7 @@ class LaneChanging:
         (0.5, 10.0),
     )
     rest: float = _number(
-        10.0,
+        12.0,
         "s",
         "from the end of a lane change to the next voluntary one",
         "chosen: few are reversed within 15 s",
