@@ -17,7 +17,7 @@ from limsim_jax.traffic.car_following import ACC, IDM
 from limsim_jax.traffic.ego import from_lane
 from limsim_jax.traffic.engine import Traffic, _give_up, drive
 from limsim_jax.traffic.lane_change import closing, incentive, urgency
-from limsim_jax.traffic.motion import boxes, smooth_step
+from limsim_jax.traffic.motion import boxes, smooth, smooth_step
 from limsim_jax.traffic.parameters import DRIVING
 from limsim_jax.types import Config, Status
 
@@ -275,6 +275,18 @@ def test_urgency_grows_towards_the_last_place_and_with_the_lanes_to_cross():
     assert not np.asarray(urgency(jnp.zeros(5, int), room, v, time)).any()
     slow = urgency(jnp.full(1, 2), jnp.full(1, 90.0), jnp.full(1, 5.0), time[:1])  # 40 m before the end
     np.testing.assert_allclose(slow, (2 * 34.5 + 40 - 90) / 69, rtol=1e-5)
+
+
+def test_accelerations_change_as_fast_as_pedals_move():
+    """Braking of emergencies begins at once; a vehicle that enters in this step has no pedal pressed yet."""
+    wish = jnp.array([1.9, -3.0, 1.9, 0.5, -6.5, -3.0])
+    before = jnp.array([0.0, 1.0, -3.0, 0.2, 1.0, 0.0])
+    state = state_of("highway", [0] * 6, [0.0] * 6, [9.0] * 6, [0] * 6)
+    entered = jnp.array([0.0, 0.0, 0.0, 0.0, 0.0, 20.0])
+    state = dataclasses.replace(state, a=before, entered=entered, step=jnp.int32(200))
+    most = DRIVING.jerk * CONFIG.dt
+    expected = [most, 1.0 - most, -3.0 + most, 0.5, -6.5, -3.0]
+    np.testing.assert_allclose(smooth(CONFIG, state, wish), expected, atol=1e-6)
 
 
 def test_lateral_motion_is_the_quintic():

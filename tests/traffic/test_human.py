@@ -2,14 +2,13 @@
 
 import dataclasses
 import math
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from traffic_worlds import drivers, motorway, shapes, state_of
+from human_driver import EXACT, wave
+from traffic_worlds import bundled, drivers, motorway, shapes, state_of
 
 from limsim_jax.simulation.rollout import Rollout, started
 from limsim_jax.sweeps.build import plain_demand
@@ -26,8 +25,6 @@ from limsim_jax.traffic.human import (
 from limsim_jax.traffic.motion import Decision
 from limsim_jax.traffic.neighbors import Obstacles, Pair
 from limsim_jax.types import Config, Perception
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 
 pytestmark = pytest.mark.engine
 
@@ -183,8 +180,6 @@ def test_vehicles_beyond_the_leader_end_where_ways_part():
 
 
 def test_waves_on_a_ring_grow_as_linear_theory_says():
-    from human_driver import EXACT, wave
-
     late = dataclasses.replace(EXACT, reaction=0.65)
     found = wave(late, 6.0, cars=12, seconds=40.0)
     assert found["theory"] > 0.1 and found["driven"] == pytest.approx(found["theory"], rel=0.06)
@@ -193,8 +188,6 @@ def test_waves_on_a_ring_grow_as_linear_theory_says():
 
 
 def test_worlds_depend_on_their_seed_alone_and_the_errors_are_their_own():
-    from traffic_worlds import bundled
-
     network, lane_map = bundled("roundabout")
     demand, _ = plain_demand(network, lane_map, rate=400.0, vehicles=8, seconds=20.0)
     run = Rollout(CONFIG, Traffic(human=HumanDriver()), 10.0)
