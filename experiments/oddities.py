@@ -99,7 +99,7 @@ def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _reversed(seen: Seen, begins: Bool[np.ndarray, "T N"]) -> Bool[np.ndarray, "T N"]:
-    """Lane changes to the other side than one less than 15 s before."""
+    """Lane changes to the other side within 15 s of one."""
     found = np.zeros_like(begins)
     for n in range(begins.shape[1]):
         times = np.flatnonzero(begins[:, n])

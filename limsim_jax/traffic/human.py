@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -30,8 +30,7 @@ _ROLLS = 1.0  # m/s, below which drivers do not err in their acceleration
 class HumanDriver:
     """What sets human drivers apart from a car-following model. All static.
 
-    The defaults are those of the paper, but for `reaction`, which is below the time gap of the default
-    drivers.
+    The errors are those of the paper. The reaction time is chosen: below the time gap of the default drivers.
 
     Raises:
       ValueError: a number out of range.
@@ -67,10 +66,6 @@ class HumanDriver:
     def errs(self) -> bool:
         """Whether anything is random."""
         return self.gap_error > 0 or self.approach_error > 0 or self.noise > 0
-
-
-NAMES = tuple(field.name for field in fields(HumanDriver))
-"""Parameters, as experiment files name them."""
 
 
 def first_perception(human: HumanDriver, config: Config, n: int) -> Perception:
@@ -206,7 +201,7 @@ def _taken_for(human: HumanDriver, state: State, true: _Situation) -> _Situation
 def _together(
     least: Callable[[Driver, _Situation], Array], driver: Driver, followed: _Situation, further: _Situation
 ) -> Array:
-    """The sum of what several vehicles ahead ask for; eq. 12 of the paper.
+    """The sum of what several vehicles ahead ask for, after the paper.
 
     The first column of `followed` is the leader on the own lane. T and s0 are divided by the square root of
     the sum of 1 / m^2 over the vehicles m that are there.
