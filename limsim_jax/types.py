@@ -155,7 +155,7 @@ class Outside:
 
 
 @struct.dataclass(frozen=True, kw_only=True)
-class Perception:
+class HumanMemory:
     """What human drivers err in and remember: see `traffic.human`."""
 
     gap: Float[Array, " N"]  # error of the gap, of variance 1
@@ -257,7 +257,7 @@ class State:
     egos: Egos
     script: Progress | None = None  # None: there is none
     outside: Outside | None = None  # None: there are none
-    perception: Perception | None = None  # None: drivers see all at once
+    human: HumanMemory | None = None  # None: drivers see all at once
 
 
 @struct.dataclass(frozen=True, kw_only=True)

@@ -27,7 +27,7 @@ from limsim_jax.traffic.collision import collided
 from limsim_jax.traffic.demand import delayed
 from limsim_jax.traffic.ego import with_rows
 from limsim_jax.traffic.engine import Tick, Traffic, drive
-from limsim_jax.traffic.human import first_perception
+from limsim_jax.traffic.human import first_memory
 from limsim_jax.traffic.script import lanes_now
 from limsim_jax.types import Config, Scenario, Schedule, State
 from limsim_jax.xla import mapped_like
@@ -121,8 +121,8 @@ class Rollout:
         if not self._free:
             egos = replace(egos, free=jnp.zeros_like(egos.free))
         human = self.traffic.human
-        memory = None if human is None else first_perception(human, self.config, state.s.shape[0])
-        state = replace(state, egos=egos, perception=memory)
+        memory = None if human is None else first_memory(human, self.config, state.s.shape[0])
+        state = replace(state, egos=egos, human=memory)
         return self.restart(lane_map, state, sighted(self.policy).init(self.config, lane_map, state))
 
     def restart(self, lane_map: LaneMap, state: State, memory: Any) -> Carry:

@@ -99,7 +99,13 @@ class HumanTable(Table):
 
 
 def _with_defaults(found: Any) -> Any:
-    return {True: {}, False: None}[found] if isinstance(found, bool) else found
+    if isinstance(found, bool):
+        return {} if found else None
+    if not isinstance(found, dict | HumanTable | None):
+        raise ValueError(
+            f"true, or a table of numbers such as reaction = {HumanDriver.reaction}; not {found!r}"
+        )
+    return found
 
 
 class TrafficTable(Table):

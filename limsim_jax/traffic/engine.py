@@ -525,9 +525,10 @@ def _follow(
 ) -> tuple[State, Float[Array, " N"]]:
     """Follow: the state with what drivers saw, and accelerations (m/s^2)."""
     if traffic.human is None:
-        return state, smooth(config, state, accelerations(traffic.model, state, decision, x))
-    a, perception = human_accelerations(traffic.human, config, traffic.model, state, decision, x)
-    return replace(state, perception=perception), smooth(config, state, a)
+        a = accelerations(traffic.model, state, decision, x)
+        return state, smooth(config, state, a)
+    a, memory = human_accelerations(traffic.human, config, traffic.model, state, decision, x)
+    return replace(state, human=memory), smooth(config, state, a)
 
 
 def _control(

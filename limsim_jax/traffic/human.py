@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key
 from limsim_jax.traffic.car_following import NO_GAP, CarFollowing
 from limsim_jax.traffic.motion import Decision, attentive, desired, seen
 from limsim_jax.traffic.neighbors import Obstacles, Pair
-from limsim_jax.types import Config, Driver, Perception, State
+from limsim_jax.types import Config, Driver, HumanMemory, State
 from limsim_jax.xla import column_min
 
 _LONGEST = 5.0  # s, of a reaction time
@@ -58,7 +58,10 @@ class HumanDriver:
             "approach_error": (0, 1), "error_time": (1e-3, math.inf), "noise": (0, math.inf),
         }  # fmt: skip
         for name, (least, most) in ranges.items():
-            if not least <= (value := getattr(self, name)) <= most:
+            value, whole = getattr(self, name), name == "vehicles_ahead"
+            if not isinstance(value, int if whole else (int, float)):
+                raise ValueError(f"{name} = {value!r}: must be a {'whole ' if whole else ''}number")
+            if not least <= value <= most:
                 upto = f" to {most}" if math.isfinite(most) else " or more"
                 raise ValueError(f"{name} = {value}: must be {least}{upto}")
 
@@ -68,11 +71,11 @@ class HumanDriver:
         return self.gap_error > 0 or self.approach_error > 0 or self.noise > 0
 
 
-def first_perception(human: HumanDriver, config: Config, n: int) -> Perception:
+def first_memory(human: HumanDriver, config: Config, n: int) -> HumanMemory:
     """Before the first decision, for `n` slots."""
     kept = math.ceil(human.reaction / config.dt - 1e-6)
     zero = jnp.zeros(n, jnp.float32)
-    return Perception(gap=zero, speed=zero, noise=zero, a=jnp.zeros((n, kept), jnp.float32))
+    return HumanMemory(gap=zero, speed=zero, noise=zero, a=jnp.zeros((n, kept), jnp.float32))
 
 
 def perceive(human: HumanDriver, config: Config, state: State, key: Key[Array, ""]) -> State:
@@ -89,7 +92,7 @@ def perceive(human: HumanDriver, config: Config, state: State, key: Key[Array, "
         stays * old + jnp.sqrt(1 - stays * stays) * x
         for old, x in zip((memory.gap, memory.speed), new[:2], strict=True)
     )
-    return replace(state, perception=replace(memory, gap=gap, speed=speed, noise=new[2]))
+    return replace(state, human=replace(memory, gap=gap, speed=speed, noise=new[2]))
 
 
 def vehicles_beyond(human: HumanDriver, state: State, own: Pair, lanes: Array) -> Obstacles | None:
@@ -116,10 +119,10 @@ def vehicles_beyond(human: HumanDriver, state: State, own: Pair, lanes: Array) -
     return Obstacles(*(jnp.stack(x, -1) for x in zip(*found, strict=True)))
 
 
-def _memory(state: State) -> Perception:
-    if state.perception is None:
-        raise ValueError("human drivers in a state without `perception`: it comes from `first_perception`")
-    return state.perception
+def _memory(state: State) -> HumanMemory:
+    if state.human is None:
+        raise ValueError("human drivers in a state without `human`: it comes from `first_memory`")
+    return state.human
 
 
 class _Situation(NamedTuple):
@@ -139,7 +142,7 @@ def human_accelerations(
     state: State,
     decision: Decision,
     x: Float[Array, " N"],
-) -> tuple[Float[Array, " N"], Perception]:
+) -> tuple[Float[Array, " N"], HumanMemory]:
     """Acceleration (m/s^2) of every vehicle, and what drivers remember.
 
     Vehicles are followed with errors and late. Places to stop are known: drivers plan for them.
@@ -219,14 +222,13 @@ def _together(
 
 def _late(
     human: HumanDriver, config: Config, state: State, wish: Float[Array, " N"]
-) -> tuple[Perception, Float[Array, " N"]]:
+) -> tuple[HumanMemory, Float[Array, " N"]]:
     """What drivers remember, and what they wanted a reaction time ago (m/s^2).
 
     A vehicle that has just entered has no past: it drives as it wants to now.
     """
     memory = _memory(state)
-    past = jnp.concatenate([wish[:, None], memory.a], -1)
-    whole = math.ceil(human.reaction / config.dt - 1e-6)
+    past, whole = jnp.concatenate([wish[:, None], memory.a], -1), memory.a.shape[1]
     part = whole - human.reaction / config.dt  # of a step
     late = past[:, whole] if whole == 0 else (1 - part) * past[:, whole] + part * past[:, whole - 1]
     new = config.time(state.step) - state.entered < human.reaction

@@ -126,8 +126,7 @@ def attentive(
     minds = (index >= 0) & state.active[index]
     gap = jnp.where(minds, gap0 + jnp.where(index >= 0, x[index], 0) - x[None], NO_GAP)
     v_lead = jnp.where(minds, state.v[index], state.v[None])
-    v0 = jnp.minimum(decision.v0, reach)
-    each, v, v_free = jax.tree.map(lambda value: value[None], (driver, state.v, v0))
+    each, v, v_free = jax.tree.map(lambda value: value[None], (driver, state.v, desired(state, decision, x)))
     kind = column_min(model(each, gap=gap, v=v, v_lead=v_lead, a_lead=jnp.zeros_like(gap), v0=v_free))
     return jnp.minimum(a, jnp.maximum(kind, -LANE_CHANGES.courtesy_braking))
 

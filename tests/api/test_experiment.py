@@ -62,6 +62,7 @@ def test_a_map_is_one_object():
         (dict(map="nix"), "map: nix: .*bundled are highway"),
         (dict(name="a b"), "a b: name: "),
         (dict(model="gipps"), "roundabout: traffic.model: "),
+        (dict(human="slow"), "traffic.human: true, or a table of numbers such as reaction = 0.7; not 'slow'"),
         (dict(mix={"car": -1.0}), "roundabout: traffic.mix.car: "),
         (dict(zones=[{"where": "1"}]), "zone.0: a zone needs closed, speed_limit or friction"),
         (dict(placed=[lj.Ego()]), "vehicle.0"),

@@ -17,14 +17,14 @@ from limsim_jax.traffic.demand import sample_scenario
 from limsim_jax.traffic.engine import Traffic, drive
 from limsim_jax.traffic.human import (
     HumanDriver,
-    first_perception,
+    first_memory,
     human_accelerations,
     perceive,
     vehicles_beyond,
 )
 from limsim_jax.traffic.motion import Decision
 from limsim_jax.traffic.neighbors import Obstacles, Pair
-from limsim_jax.types import Config, Perception
+from limsim_jax.types import Config, HumanMemory
 
 pytestmark = pytest.mark.engine
 
@@ -51,11 +51,11 @@ def platoon(n, seed, human):
     state = state_of("highway", [lane] * n, place, v, [goal] * n, driver=driver, shape=shapes(n, 5.0))
     kept = math.ceil(human.reaction / CONFIG.dt - 1e-6)
     f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    memory = Perception(
+    memory = HumanMemory(
         gap=f32(rng.normal(size=n)), speed=f32(rng.normal(size=n)), noise=f32(rng.normal(size=n)),
         a=f32(rng.uniform(-2, 1, (n, kept))),
     )  # fmt: skip
-    state = dataclasses.replace(state, a=f32(rng.uniform(-2, 1, n)), perception=memory, step=jnp.int32(200))
+    state = dataclasses.replace(state, a=f32(rng.uniform(-2, 1, n)), human=memory, step=jnp.int32(200))
     gap[0] = NO_GAP
     own = Pair(
         lead=jnp.arange(n, dtype=jnp.int32) - 1, lead_gap=f32(gap), lag=jnp.full(n, -1), lag_gap=f32(gap)
@@ -89,7 +89,7 @@ def test_accelerations_are_those_of_the_paper(human):
         lambda state, decision, x: human_accelerations(human, CONFIG, IDM(), state, decision, x)
     )(state, decision, jnp.asarray(x, jnp.float32))
     d, v, a = (jax.tree.map(np.asarray, z) for z in (state.driver, state.v, state.a))
-    seen = jax.tree.map(np.asarray, state.perception)
+    seen = jax.tree.map(np.asarray, state.human)
     delay, ahead = human.reaction, human.reaction if human.anticipates else 0.0
     wanted = []
     for i in range(n):
@@ -126,8 +126,8 @@ def test_a_vehicle_that_has_just_entered_does_not_drive_by_the_past_of_its_slot(
     late, memory = human_accelerations(HumanDriver(), CONFIG, IDM(), state, decision, x)
     new = np.array([False, True, False, True])
     np.testing.assert_allclose(late[new], np.asarray(memory.a)[new, 0], atol=1e-6)
-    assert state.perception is not None
-    np.testing.assert_allclose(late[~new], np.asarray(state.perception.a)[~new, 6], atol=1e-6)
+    assert state.human is not None
+    np.testing.assert_allclose(late[~new], np.asarray(state.human.a)[~new, 6], atol=1e-6)
 
 
 def test_places_to_stop_are_not_seen_late():
@@ -149,12 +149,12 @@ def test_errors_are_ornstein_uhlenbeck_processes():
     human = HumanDriver(error_time=10.0)
     n, steps = 500, 200
     state = state_of("highway", [0] * n, [0.0] * n, [0.0] * n, [0] * n)
-    state = dataclasses.replace(state, perception=first_perception(human, CONFIG, n))
+    state = dataclasses.replace(state, human=first_memory(human, CONFIG, n))
 
     def go_on(state, k):
         state = perceive(human, CONFIG, state, jax.random.fold_in(jax.random.key(4), k))
-        assert state.perception is not None
-        return dataclasses.replace(state, step=state.step + 5), (state.perception.gap, state.perception.speed)
+        assert state.human is not None
+        return dataclasses.replace(state, step=state.step + 5), (state.human.gap, state.human.speed)
 
     gap, speed = (np.asarray(x) for x in jax.lax.scan(go_on, state, jnp.arange(steps))[1])
     for x in (gap, speed):
@@ -202,12 +202,12 @@ def test_worlds_depend_on_their_seed_alone_and_the_errors_are_their_own():
     both = jax.jit(jax.vmap(lambda seed: end(seed)))(seeds)
     one = end(jnp.int32(7))
     np.testing.assert_allclose(both.s[1], one.s, atol=1e-3)
-    assert not np.allclose(both.perception.gap[0], both.perception.gap[1])
+    assert not np.allclose(both.human.gap[0], both.human.gap[1])
     with pytest.raises(ValueError, match="needs a key"):
         drive(CONFIG, Traffic(human=HumanDriver()), lane_map, one)
-    with pytest.raises(ValueError, match="first_perception"):
+    with pytest.raises(ValueError, match="first_memory"):
         drive(
-            CONFIG, Traffic(human=HumanDriver()), lane_map, dataclasses.replace(one, perception=None),
+            CONFIG, Traffic(human=HumanDriver()), lane_map, dataclasses.replace(one, human=None),
             key=jax.random.key(0),
         )  # fmt: skip
 
@@ -220,6 +220,8 @@ def test_worlds_depend_on_their_seed_alone_and_the_errors_are_their_own():
         ({"error_time": 0.0}, "error_time = 0.0: must be 0.001 or more"),
         ({"noise": -1.0}, "noise = -1.0: must be 0 or more"),
         ({"gap_error": float("nan")}, "gap_error = nan: must be 0 to 1"),
+        ({"reaction": "fast"}, "reaction = 'fast': must be a number"),
+        ({"vehicles_ahead": 2.5}, "vehicles_ahead = 2.5: must be a whole number"),
     ],
 )
 def test_numbers_out_of_range_are_refused(values, message):

@@ -478,19 +478,22 @@ def _candidates(
     return [(int(a), int(b)) for a, b in found[meet]]
 
 
-def lanes_within(lane: Lane, lanes: Mapping[str, Lane], reach: float, links: str = "successors") -> set[str]:
-    """Ids of lanes that start less than `reach` m after this one.
+def lanes_within(
+    lane: Lane, lanes: Mapping[str, Lane], reach: float, links: str = "successors"
+) -> dict[str, float]:
+    """Lanes that start within `reach` m after one, and the way there.
 
-    With `links` "predecessors", of those that end as little before it.
+    With `links` "predecessors", those that end as little before it.
     """
-    found: set[str] = set()
+    found: dict[str, float] = {}
     todo = [(name, 0.0) for name in getattr(lane, links)]
     while todo:
         name, gap = todo.pop()
         if name in lanes and name not in found and gap < reach:
-            found.add(name)
+            found[name] = gap
             todo.extend((after, gap + lanes[name].length) for after in getattr(lanes[name], links))
-    return found - {lane.id}
+    found.pop(lane.id, None)
+    return found
 
 
 def _classify(lanes: Sequence[Lane], overlaps: list[Overlap]) -> list[Overlap]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from limsim_jax.maps.conflicts.overlaps import Overlap
+from limsim_jax.maps.conflicts.overlaps import Overlap, lanes_within
 from limsim_jax.maps.conflicts.priority import RightOfWay
 from limsim_jax.maps.conflicts.table import ConflictTable, ConflictType
 from limsim_jax.maps.network import Lane, Movement, Network
@@ -111,9 +111,12 @@ def stand_back(
         into = {network.lanes[name].junction for name in lane.successors if name in rows}
         into -= {lane.junction, None}
         line = lane.length - float(stop_s[rows[lane.id]])
+        before = lanes_within(lane, network.lanes, FARTHEST - lane.length, "predecessors")
+        ends = {lane.id: lane.length}  # m from the start of a lane to the end of this one
+        ends |= {name: lane.length + gap + network.lanes[name].length for name, gap in before.items()}
         stretches = [
             (end - s_out, end - s_in)
-            for name, end in _before(network, lane)
+            for name, end in ends.items()
             for other, s_in, s_out in across.get(name, ())
             if other in into
         ]
@@ -123,17 +126,6 @@ def stand_back(
         if place <= FARTHEST:
             back[rows[lane.id]] = place - line
     return back
-
-
-def _before(network: Network, lane: Lane) -> Iterator[tuple[str, float]]:
-    """A lane and those before it; each with m from its start to the end."""
-    todo = [(lane.id, lane.length)]
-    while todo:
-        name, end = todo.pop()
-        yield name, end
-        if end < FARTHEST:
-            before = network.lanes[name].predecessors
-            todo.extend((x, end + network.lanes[x].length) for x in before if x in network.lanes)
 
 
 def _opposed(movement: Movement, k: int, foes: Iterable[tuple[float, int]], right_of_way: RightOfWay) -> bool:

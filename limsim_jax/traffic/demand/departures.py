@@ -88,7 +88,7 @@ def enter(config: Config, lane_map: LaneMap, schedule: Schedule, state: State) -
         active=taken,
     )
     fresh = replace(fresh, vehicle=mine, entered=jnp.full(n, now))
-    world = {"step", "queues", "lights", "egos", "script", "perception"}
+    world = {"step", "queues", "lights", "egos", "script", "human"}
 
     def chosen(new: Array, old: Array) -> Array:
         return jnp.where(taken.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -87,7 +87,7 @@ def give_way(
         blocked=everywhere(held | queued[:, None]),
         yielding=everywhere(state.yielding),
         slowing=everywhere(state.a < -JUNCTIONS.slowing),
-        starts=everywhere((state.a > JUNCTIONS.starting) & (state.v > 0)),
+        starts=everywhere(starts & (state.v > 0)),
         light=light.astype(jnp.float32),
         slot=everywhere(jnp.arange(n)),
         soonest=approaches.soonest,
@@ -100,8 +100,9 @@ def give_way(
     wait_s = table.wait_s[approaches.connector]
     stop, waits = stops_at_conflicts(wait_s, approaches, observed.brake, until, sign | full)
     stop = jnp.minimum(stop, at_light)
-    stop, full = keeps_clear(lane_map, state, approaches, own, observed.brake, stop)
-    waits |= full
+    if table.foe.shape[1]:
+        stop, has_no_room = keeps_clear(lane_map, state, approaches, own, observed.brake, stop)
+        waits |= has_no_room
     yielding = state.active & waits.any(-1) & (state.v < stands)  # a vehicle that moves may yet come
     stop = stop.min(-1)
     return RightOfWay(

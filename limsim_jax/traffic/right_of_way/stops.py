@@ -78,11 +78,11 @@ def exit_full(lane_map: LaneMap, state: State, approaches: Approaches, own: Pair
       approaches: connectors ahead.
       own: leader and follower on the own route.
     """
-    clear = lane_map.conflicts.cross_s[approaches.connector]
-    needed = clear - approaches.x + state.shape.length[:, None] + state.driver.s0[:, None]
+    crosses, needed = _past_crossings(lane_map, state, approaches)
+    needed += state.driver.s0[:, None]
     slow = (own.lead >= 0) & (state.v[own.lead] < JUNCTIONS.standstill)
     room = own.lead_gap + JUNCTIONS.exit_time * state.v[own.lead]
-    return (clear > 0) & slow[:, None] & (room[:, None] < needed) & (approaches.line > -JUNCTIONS.margin)
+    return crosses & slow[:, None] & (room[:, None] < needed) & (approaches.line > -JUNCTIONS.margin)
 
 
 def keeps_clear(
@@ -109,14 +109,13 @@ def keeps_clear(
     Returns:
       m to where it stops for each, and for which it waits for the next junction.
     """
-    clear = lane_map.conflicts.cross_s[approaches.connector]
-    needed = clear - approaches.x + state.shape.length[:, None]
+    crosses, needed = _past_crossings(lane_map, state, approaches)
     comes = first = stop.min(-1)
     behind = jnp.full_like(first, NO_GAP)
     for _ in range(_LEADERS):
         behind = jnp.where(own.lead >= 0, own.lead_gap + comes[own.lead] - state.driver.s0, NO_GAP)
         comes = jnp.minimum(first, behind)
-    ahead = (approaches.line > -JUNCTIONS.margin) & (approaches.line + JUNCTIONS.margin > brake) & (clear > 0)
+    ahead = (approaches.line > -JUNCTIONS.margin) & (approaches.line + JUNCTIONS.margin > brake) & crosses
     line = jnp.maximum(approaches.line - JUNCTIONS.margin, -JUNCTIONS.margin)
     places, waits = [], []
     here = later = jnp.full_like(state.s, NO_GAP)  # first stops in the junction of a connector, and beyond
@@ -131,6 +130,14 @@ def keeps_clear(
         places.append(place)
         waits.append(full)
     return jnp.stack(places[::-1], -1), jnp.stack(waits[::-1], -1)
+
+
+def _past_crossings(
+    lane_map: LaneMap, state: State, approaches: Approaches
+) -> tuple[Bool[Array, "N R"], Float[Array, "N R"]]:
+    """Whether paths cross a connector; m until the tail is past."""
+    clear = lane_map.conflicts.cross_s[approaches.connector]
+    return clear > 0, clear - approaches.x + state.shape.length[:, None]
 
 
 def stop_signs(
