@@ -102,7 +102,9 @@ def test_a_sweep_keeps_what_the_model_answered(drive, tmp_path):
     assert sum(table["language_calls"]) == drive.said.number > 20
     shares = {name: table[f"language_{name}"] for name in ("ok", "repaired", "illegal")}
     np.testing.assert_allclose(np.sum(list(shares.values()), 0), 1)
-    assert 0 < min(shares["ok"]) and max(shares["ok"]) < 1
+    # over both worlds: in which of them a question is the third one is chance, and an equal question is not
+    # asked again
+    assert 0 < np.mean(shares["ok"]) < 1
     assert all(10 < x <= 20 for x in table["language_questions"])
     prices = [
         PRICES[f"{name}_price"] * np.array(table[f"language_{name}_tokens"]) for name in ("prompt", "answer")
