@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, width
@@ -20,11 +21,14 @@ from limsim_jax.numerics import safe_divide
 from limsim_jax.traffic.ego import at_slots, is_free
 from limsim_jax.traffic.motion import lateral_speed, pace
 from limsim_jax.types import State
+from limsim_jax.xla import mapped_like
 
 COURSE = 5.0
 """s for which paths are followed; a longer time to collision is not checked."""
 
 _EVERY = 0.25  # s between looks: at 20 m/s less than the length of a body
+_AT_ONCE = 8  # vehicles that are looked at together
+_ROUNDING = 0.1  # m
 
 
 class Course(NamedTuple):
@@ -82,25 +86,26 @@ def aside(lane_map: LaneMap, state: State) -> Aside:
 
 
 @jax.named_scope("course")
-def course(lane_map: LaneMap, slot: Int[Array, ""], vehicles: OnLanes) -> Course:
+def course(
+    lane_map: LaneMap, slot: Int[Array, ""], vehicles: OnLanes, near: Bool[Array, " N"] | None = None
+) -> Course:
     """The course of all vehicles relative to the ego in `slot`.
 
     Bodies keep their offset and their angle to the lane, but for what they still go `aside`. A vehicle that
     has changed lanes since its `way` was known goes on along its lane; one without a lane may meet any.
+
+    Args:
+      lane_map: where.
+      slot: of the ego.
+      vehicles: all of them.
+      near: those whose `meets` is wanted; the others get `NONE`. None: all.
     """
     way, lane = vehicles.way, vehicles.lane
     here, known = way == lane[:, None], lane != NO_LANE
     alone = jnp.full_like(way, NO_LANE).at[:, 0].set(lane)
     way = jnp.where(here.any(-1)[:, None], way, alone)
-    box = _ahead(lane_map, vehicles._replace(way=way), jnp.argmax(here, -1))  # [N, T, 5]
-    none = jnp.zeros_like(box[..., :2])
-
-    def touching(ego: Float[Array, " 5"], others: Float[Array, "N 5"]) -> Bool[Array, " N"]:
-        return overlaps(encounter(ego, none[0, 0], others, none[:, 0]))
-
-    touches = jax.vmap(touching, (0, 1))(box[slot], box)  # [T, N]
-    first = jnp.argmax(touches, 0).astype(box.dtype) - 1  # it may have been any time since the look before
-    meets = jnp.where(touches.any(0), jnp.maximum(first, 0) * _EVERY, NONE)
+    wanted = jnp.ones_like(known) if near is None else near
+    meets = _meets(lane_map, slot, vehicles._replace(way=way), jnp.argmax(here, -1), wanted)
     same = lane == lane[slot]
     mine = (lane[:, None] == way[slot][None, :]).any(-1) & known
     over = (way == lane[slot]).any(-1) & known[slot]
@@ -112,6 +117,60 @@ def course(lane_map: LaneMap, slot: Int[Array, ""], vehicles: OnLanes) -> Course
         follows=follows | (joins & (ahead < 0)),
         leads=leads | (joins & (ahead > 0)),
     )
+
+
+def comes_near(
+    slot: Int[Array, ""], box: Float[Array, "N 5"], velocity: Float[Array, "N 2"]
+) -> Bool[Array, " N"]:
+    """Vehicles that may touch that in `slot` within `COURSE` s if all keep their velocities.
+
+    The circles around their bodies meet: of all others, boxes do not.
+    """
+    place, motion = box[:, :2] - box[slot, :2], velocity - velocity[slot]
+    square = jnp.sum(motion * motion, -1)
+    nearest = safe_divide(-jnp.sum(place * motion, -1), square)
+    apart = place + motion * jnp.clip(nearest, 0, COURSE)[:, None]
+    radius = jnp.sqrt(jnp.sum(box[:, 3:] * box[:, 3:], -1)) / 2
+    reach = radius + radius[slot] + _ROUNDING
+    return jnp.sum(apart * apart, -1) <= reach * reach
+
+
+def _meets(
+    lane_map: LaneMap,
+    slot: Int[Array, ""],
+    vehicles: OnLanes,
+    first: Int[Array, " N"],
+    near: Bool[Array, " N"],
+) -> Float[Array, " N"]:
+    """s from now, not before that bodies touch along their lanes; of those not `near` the ego `NONE`.
+
+    `first`: column of `way` of the own lane. Few vehicles are near, so some are looked at at once, and then
+    the next ones, if there are more.
+    """
+    rows, slots = lax.stop_gradient((vehicles, first)), jnp.arange(near.shape[0])
+    rank = jnp.where(near, jnp.cumsum(near) - 1, -1)
+
+    def boxes(which: Int[Array, " K"]) -> Float[Array, "T K 5"]:
+        some, column = jax.tree.map(lambda x: x[which], rows)
+        return jnp.moveaxis(_ahead(lane_map, some, column), 0, 1)
+
+    ego = boxes(slot[None])[:, 0]
+    still = jnp.zeros_like(ego[0, :2])
+
+    def touching(ego: Float[Array, " 5"], others: Float[Array, "K 5"]) -> Bool[Array, " K"]:
+        return overlaps(encounter(ego, still, others, jnp.broadcast_to(still, others[:, :2].shape)))
+
+    def look(turn: Int[Array, ""], meets: Float[Array, " N"]) -> Float[Array, " N"]:
+        those = rank[:, None] == turn * _AT_ONCE + jnp.arange(_AT_ONCE)[None]  # [N, K]
+        which = jnp.max(jnp.where(those, slots[:, None], 0), 0)
+        touches = jax.vmap(touching)(ego, boxes(which))  # [T, K]
+        looks = jnp.arange(touches.shape[0], dtype=meets.dtype)
+        touch = jnp.min(jnp.where(touches, looks[:, None], NONE), 0)
+        time = jnp.where(touch < NONE, jnp.maximum(touch - 1, 0) * _EVERY, NONE)  # or since the last look
+        return jnp.where(those.any(-1), jnp.min(jnp.where(those, time[None], NONE), -1), meets)
+
+    turns = (jnp.sum(near, dtype=jnp.int32) + _AT_ONCE - 1) // _AT_ONCE
+    return lax.fori_loop(0, turns, look, mapped_like(vehicles.s, jnp.full(near.shape, NONE)))
 
 
 def _beside(vehicles: OnLanes, slot: Int[Array, ""]) -> tuple[Bool[Array, " N"], Float[Array, " N"]]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap
 from limsim_jax.metrics.catalog import DERIVED, EGO, TRAFFIC
-from limsim_jax.metrics.course import Aside, Course, OnLanes, aside, course
+from limsim_jax.metrics.course import Aside, Course, OnLanes, aside, comes_near, course
 from limsim_jax.metrics.description import Description
 from limsim_jax.metrics.ego import EgoCarry, EgoMetrics
 from limsim_jax.metrics.measure import Metric, Own, check_names
@@ -324,12 +324,14 @@ class EvaluateTraffic:
 def paths(lane_map: LaneMap, slot: Int[Array, ""], records: StepRecord) -> tuple[Bool[Array, " N"], Course]:
     """Of the records since a decision: paths that may meet that of the ego in `slot`, and when they do.
 
-    Times of meeting are in s since the start of the world.
+    Times of meeting are in s since the start of the world; of vehicles that come nowhere near on straight
+    lines they are not known, and do not count.
     """
     flow, way = records.traffic, records.way[0]
     now = jax.tree.map(lambda x: x[0], records.aside)
     vehicles = OnLanes(way, flow.lane[0], flow.s[0], flow.v[0], records.ego.box[0], now, records.other[0])
-    found = course(lane_map, slot, vehicles)
+    near = jax.vmap(comes_near, (None, 0, 0))(slot, records.ego.box, records.ego.velocity).any(0)
+    found = course(lane_map, slot, vehicles, near)
     relevant = meets_ego(lane_map, slot, way, records.other.max(0))
     return relevant, found._replace(meets=found.meets + flow.t[0])
 

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from limsim_jax.metrics.reductions import Least
 from limsim_jax.numerics import safe_sqrt
 from limsim_jax.traffic.car_following import NO_GAP
+from limsim_jax.xla import computed_once
 
 NONE = 1e6
 """s: no collision, no conflict."""
@@ -164,7 +165,7 @@ def contact_interval(e: Encounter) -> tuple[Float[Array, "*b"], Float[Array, "*b
     # Compilers may compute a speed twice and round it differently. So its sign, which is that of its error
     # where bodies stand still, does not matter there: bodies apart stay apart, and the others in touch.
     begins, ceases = [], []
-    for offset, speed, extent in zip(*_axes(e), strict=True):
+    for offset, speed, extent in zip(*computed_once(_axes(e)), strict=True):
         still, far = jnp.abs(speed) < STILL, jnp.abs(offset)
         toward = jnp.where(speed < 0, -offset, offset)
         fast = jnp.where(still, 1e-9, jnp.abs(speed))

@@ -27,6 +27,7 @@ from limsim_jax.metrics.safety import (
 )
 from limsim_jax.numerics import safe_norm
 from limsim_jax.types import State
+from limsim_jax.xla import computed_once
 
 
 class EgoStep(NamedTuple):
@@ -168,7 +169,9 @@ class StepView:
     @cached_property
     def encounter(self) -> Encounter:
         """All vehicles in the axes of the ego, `[N]`."""
-        return encounter(self.ego_box, self.ego_velocity, self.record.box, self.record.velocity)
+        return computed_once(
+            encounter(self.ego_box, self.ego_velocity, self.record.box, self.record.velocity)
+        )
 
     @cached_property
     def contact_interval(self) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
@@ -236,7 +239,7 @@ class StepView:
         along = jnp.where(self.touches | (self.ttc >= COURSE), 0, along)
         calm = record.follows & self._calm(-1.0)
         counts = ((record.relevant | leaving) & (along < COURSE) & ~calm) | self.touches
-        return jnp.where(self.apart & counts, greater(self.ttc, along), NONE)
+        return computed_once(jnp.where(self.apart & counts, greater(self.ttc, along), NONE))
 
     @cached_property
     def least_ttc_2d(self) -> Float[Array, ""]:
@@ -261,7 +264,7 @@ class StepView:
         As `least_ttc`, but a vehicle that the ego closes up to from behind counts only if the ego must brake
         harder than `FIRM_BRAKING`.
         """
-        ttc = jnp.where(self.record.leads & self._calm(1.0), NONE, self.ttc_on_course)
+        ttc = computed_once(jnp.where(self.record.leads & self._calm(1.0), NONE, self.ttc_on_course))
         lane = jnp.where(drac(self.gap, self.v, self.v_leader) > FIRM_BRAKING, self.least_ttc_1d, NONE)
         other = jnp.argmin(ttc).astype(self.leader.dtype)
         least = jnp.min(ttc)
