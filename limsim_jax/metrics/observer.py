@@ -324,15 +324,15 @@ class EvaluateTraffic:
 def paths(lane_map: LaneMap, slot: Int[Array, ""], records: StepRecord) -> tuple[Bool[Array, " N"], Course]:
     """Of the records since a decision: paths that may meet that of the ego in `slot`, and when they do.
 
-    Times of meeting are in s since the start of the world; of vehicles that come nowhere near on straight
-    lines they are not known, and do not count.
+    Times of meeting are in s since the start of the world. Of vehicles that come nowhere near on straight
+    lines, or keep to other lanes, they are not known, and do not count.
     """
     flow, way = records.traffic, records.way[0]
     now = jax.tree.map(lambda x: x[0], records.aside)
     vehicles = OnLanes(way, flow.lane[0], flow.s[0], flow.v[0], records.ego.box[0], now, records.other[0])
-    near = jax.vmap(comes_near, (None, 0, 0))(slot, records.ego.box, records.ego.velocity).any(0)
-    found = course(lane_map, slot, vehicles, near)
     relevant = meets_ego(lane_map, slot, way, records.other.max(0))
+    near = jax.vmap(comes_near, (None, 0, 0))(slot, records.ego.box, records.ego.velocity).any(0)
+    found = course(lane_map, slot, vehicles, near & (relevant | records.ego.changing[:, slot].any()))
     return relevant, found._replace(meets=found.meets + flow.t[0])
 
 

@@ -24,6 +24,7 @@ from limsim_jax.traffic.engine import Tick
 from limsim_jax.traffic.motion import boxes
 from limsim_jax.traffic.signals import crosses_on_red
 from limsim_jax.types import Config, State, Status
+from limsim_jax.xla import computed_once
 
 AT_RED = 15.0
 """m before a red light within which a standing ego waits for it."""
@@ -245,6 +246,5 @@ def meets_ego(
     lanes = jnp.concatenate([way, other[:, None]], -1)
     mine = lanes[slot]
     foes = table.lane[table.foe[table.connector[mine]]].ravel()  # NO_LANE where there is none
-    ours = jnp.concatenate([mine, foes])
-    meets = (lanes[..., None] == ours[None, None]) & (ours != NO_LANE)[None, None]
-    return meets.any((-1, -2))
+    ours = jnp.zeros(lane_map.valid.shape, bool).at[jnp.concatenate([mine, foes])].set(True)
+    return computed_once(ours[lanes] & (lanes != NO_LANE)).any(-1)

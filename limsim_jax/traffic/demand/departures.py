@@ -17,6 +17,7 @@ from limsim_jax.traffic.car_following import safe_speed
 from limsim_jax.traffic.neighbors import follow_routes, look_ahead, other_lane
 from limsim_jax.traffic.state import start_state
 from limsim_jax.types import Config, Queues, Schedule, State
+from limsim_jax.xla import computed_once
 
 AT_ONCE = 16
 """Departures that a decision looks at, at most."""
@@ -180,4 +181,4 @@ def _room_behind(
     # own speed <= `safe_speed`, squared
     asks = state.v * (state.v + 2 * driver.b * driver.T) + 2 * driver.b * driver.s0
     follows = (gap >= _REAR_ROOM) & (asks[None] - 2 * driver.b[None] * gap <= (v * v)[:, None])
-    return jnp.all(follows, 1)
+    return jnp.all(computed_once(follows), 1)
