@@ -27,7 +27,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int
 
-from limsim_jax.files import cache_directory, write_whole
+from limsim_jax.files import cache_directory, forget_oldest, write_whole
 
 Tree = TypeVar("Tree")
 
@@ -173,7 +173,7 @@ def enable_compilation_cache() -> None:
     """Keep compiled programs on disk, in JAX's folder if it has one."""
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "xla"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 class _Aside:
@@ -285,7 +285,7 @@ def keep_program(name: str | None, program: Any) -> Any:
         shardings = jax.tree.leaves((program.input_shardings, program.output_shardings))
         devices = max((len(x.device_set) for x in shardings), default=1)
         write_whole(path, pickle.dumps((devices, *serialize_executable.serialize(program))))
-        _forget(path.parent)
+        forget_oldest(path.parent, PROGRAMS)
     return program
 
 
@@ -301,9 +301,3 @@ def _program_path(name: str) -> Path:
     key = hashlib.sha256(repr((name, settings)).encode()).hexdigest()[:32]
     return Path(config["jax_compilation_cache_dir"]) / "limsim_jax" / f"{key}.bin"
 
-
-def _forget(folder: Path) -> None:
-    """Remove the programs that were not used for the longest time."""
-    paths = sorted(folder.glob("*.bin"), key=lambda path: path.stat().st_mtime, reverse=True)
-    for path in paths[PROGRAMS:]:
-        path.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import warnings
@@ -17,6 +18,9 @@ from limsim_jax.cli.bench import bench_app
 from limsim_jax.cli.maps import map_app
 from limsim_jax.cli.run import run
 from limsim_jax.cli.serve import serve_app
+
+# Tracing and reading make many objects that stay: looking for garbage among them takes a twentieth of a command.
+gc.set_threshold(100_000, 50, 50)
 
 # XLA logs an error for every program that it loads from its own cache on a CPU; nothing is wrong.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

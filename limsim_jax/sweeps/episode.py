@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import limsim_jax
+from limsim_jax.files import remembered
 from limsim_jax.maps import bundled_maps
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.map import Map
@@ -69,8 +70,11 @@ from limsim_jax.types import Config, Scenario, State
 
 _SHARE_OF_MEMORY = 0.25
 _TEMPORARIES = 12  # memory of a running world, in units of its arrays
-_CHUNKS = {"cpu": 50, "gpu": 2000, "tpu": 2000}
-"""Worlds per call, if memory allows: round numbers of seeds leave no chunk half empty."""
+_WORLDS = {"cpu": 10, "gpu": 2000, "tpu": 2000}
+"""Worlds per device and call, if memory allows. On CPUs more are hardly faster, and few seeds wait for them."""
+
+_LEAST = {"cpu": 20}
+"""Worlds per call at least, so that machines of one and of two cores make the same rows."""
 
 AFTERWARDS = 12.0
 """s that a brief replay goes on without its ego: `UNSAFE` s, and the look-ahead of a planner at their end."""
@@ -86,7 +90,8 @@ class Episodes:
 
     Args:
       experiment: the file's tables.
-      chunk: worlds per call; by default as many as memory allows, at most 50 on CPUs and 2000 on others.
+      chunk: worlds per call; by default a round number from 10 a device on CPUs and 2000 on others, less
+        if memory does not allow that.
       policy: drives the egos; None: the one that the experiment names.
       name: of the policy in results; None: that of the experiment.
       town: the map; None: the one that the experiment names.
@@ -140,18 +145,16 @@ class Episodes:
         behaviour = traffic_of(experiment, model)
         self.rollout = Rollout(config, behaviour, experiment.horizon, self._policy, measure=self._measure)
         self._code = self._check_policy()
-        self.world_bytes = self._memory()
-        self.chunk = self._chunk() if chunk is None else chunk
-        run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
         source, slots = source_hash(), experiment.slots
         sumo = self._sumo
         drawn = self.lane_map, self._demand, self._egos, self._placed, self._script, slots
         if sumo is not None:
             drawn += sumo.tables
-        names = (
-            None if sumo is not None and sumo.random else describe_program(source, *drawn),
-            describe_program(source, replace(run, horizon=1.0)),  # programs run for any time
-        )
+        sampling = None if sumo is not None and sumo.random else describe_program(source, *drawn)
+        self.world_bytes = remembered(sampling and f"bytes of a world {sampling}", self._memory)
+        self.chunk = self._chunk() if chunk is None else chunk
+        run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
+        names = sampling, describe_program(source, replace(run, horizon=1.0))  # programs run for any time
         self.worlds = Worlds(run, self.lane_map, self.sample, chunk=self.chunk, names=names)
         self.chunk = self.worlds.chunk
 
@@ -332,9 +335,11 @@ class Episodes:
         else:
             memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         most = int(_SHARE_OF_MEMORY * memory / self.world_bytes)
-        most = max(1, min(most, _CHUNKS.get(device.platform, 50)))
-        size = 10 ** (len(str(most)) - 1)
-        return max(k * size for k in (1, 2, 5) if k * size <= most)
+        platform = device.platform
+        wanted = max(_WORLDS.get(platform, 10) * jax.local_device_count(), _LEAST.get(platform, 1))
+        # a round number leaves no chunk half empty
+        fits = [x for n in range(9) for k in (1, 2, 5) if (x := k * 10**n) <= max(most, 1)]
+        return next((x for x in fits if x >= wanted), fits[-1])
 
     def provenance(self) -> dict[str, Any]:
         """Where the rows come from."""
