@@ -300,4 +300,3 @@ def _program_path(name: str) -> Path:
     ]  # fmt: skip
     key = hashlib.sha256(repr((name, settings)).encode()).hexdigest()[:32]
     return Path(config["jax_compilation_cache_dir"]) / "limsim_jax" / f"{key}.bin"
-

@@ -254,7 +254,7 @@ class StepView:
     @cached_property
     def least_ttc_other(self) -> Int[Array, ""]:
         """Slot of the vehicle with that time."""
-        other = jnp.argmin(self.ttc_on_course).astype(self.leader.dtype)
+        other = _first(self.ttc_on_course == self.least_ttc_2d).astype(self.leader.dtype)
         return jnp.where(self.least_ttc_1d < self.least_ttc_2d, self.leader, other)
 
     @cached_property
@@ -266,8 +266,8 @@ class StepView:
         """
         ttc = computed_once(jnp.where(self.record.leads & self._calm(1.0), NONE, self.ttc_on_course))
         lane = jnp.where(drac(self.gap, self.v, self.v_leader) > FIRM_BRAKING, self.least_ttc_1d, NONE)
-        other = jnp.argmin(ttc).astype(self.leader.dtype)
         least = jnp.min(ttc)
+        other = _first(ttc == least).astype(self.leader.dtype)
         return jnp.minimum(least, lane), jnp.where(lane < least, self.leader, other)
 
     def _calm(self, side: float) -> Bool[Array, " N"]:
@@ -309,3 +309,8 @@ class StepView:
     def d(self) -> Float[Array, ""]:
         """Offset of the ego from its lane centre, m, left > 0."""
         return self.state.d[self.slot]
+
+
+def _first(flags: Bool[Array, " N"]) -> Int[Array, ""]:
+    """The first one that is set; vectorised, which `argmax` is not."""
+    return jnp.min(jnp.where(flags, jnp.arange(flags.shape[0]), flags.shape[0] - 1))

@@ -308,6 +308,8 @@ def at_slots(
         return into
     mine = egos.slot[:, None] == jnp.arange(into.shape[0], dtype=egos.slot.dtype)[None, :]
     mine = mine if which is None else mine & which[:, None]
+    if egos.slot.shape[0] == 1:
+        return jnp.where(mine[0], value[0], into)
     return jnp.where(mine.any(0), value[jnp.argmax(mine, 0)], into)
 
 

@@ -184,8 +184,8 @@ def decide(
     end = jnp.maximum(
         end - choice.stops_before, jnp.minimum(end, state.v * state.v / (2 * DRIVING.gentle_braking))
     )
-    stop_obstacle = jnp.minimum(jnp.minimum(end, way.stop + state.driver.s0), blocked.stop)
-    own, second = pulling_out(lane_map, state, blocked.stands, own, second, other, other_s)
+    stop_obstacle = computed_once(jnp.minimum(jnp.minimum(end, way.stop + state.driver.s0), blocked.stop))
+    own, second = computed_once(pulling_out(lane_map, state, blocked.stands, own, second, other, other_s))
     obstacles = Obstacles(
         jnp.stack([own.lead, second.lead, way.lead, jnp.full_like(own.lead, -1)], -1),
         jnp.stack([own.lead_gap, second.lead_gap, way.lead_gap, stop_obstacle], -1),
@@ -299,7 +299,7 @@ def _lane_end(lane_map: LaneMap, state: State, ahead: Ahead) -> Float[Array, " N
     wait = jnp.where((state.side != 0)[:, None], wide, jnp.minimum(jnp.maximum(room, stopping), wide))
     leaves = (state.side != 0) & ~state.crossed
     end = jnp.where(leaves[:, None], end, wait)
-    end = jnp.min(jnp.where(stuck & state.active[:, None], end, NO_GAP), -1)
+    end = jnp.min(computed_once(jnp.where(stuck & state.active[:, None], end, NO_GAP)), -1)
     # it matters from where a driver begins to brake for it
     begins = state.v * (state.v / (2 * DRIVING.end_comfort) + DRIVING.end_sight) + state.driver.s0
     return jnp.where(end > begins, NO_GAP, end)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from limsim_jax.geometry import polynomial
+from limsim_jax.geometry import direction, polynomial
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, width
 from limsim_jax.numerics import safe_divide
 from limsim_jax.traffic.bodies import place_behind
@@ -331,7 +331,7 @@ def boxes(lane_map: LaneMap, state: State) -> Float[Array, "N 5"]:
     dx, dy = x[:, 0] - x[:, 1], y[:, 0] - y[:, 1]
     # axles of a vehicle without a wheelbase are in one place
     apart = shape.wheelbase > _NO_WHEELBASE
-    heading = jnp.where(apart, jnp.arctan2(dy, jnp.where(apart, dx, 1.0)), along[:, 0])
+    heading = jnp.where(apart, direction(dx, dy), along[:, 0])
     x, y = x.mean(-1), y.mean(-1)
     slope = jnp.clip(lateral_speed(state) / jnp.maximum(state.v, 0.5), -_STEEPEST, _STEEPEST)
     turned = slope * polynomial((1, -1 / 3, 1 / 5, -1 / 7), slope * slope)  # the arc tangent, to 1e-7
