@@ -41,7 +41,7 @@ DIVIDING_PASS = "cpu-parallel-task-assigner"
 """The pass of XLA that divides loops among threads, where worlds are divided already."""
 
 TREES_PASS = "tree_reduction_rewriter"
-"""The pass of XLA that turns reductions over more than 16 values into trees of windows, without vector code."""
+"""The pass of XLA that makes trees of windows of long reductions, without vector code."""
 
 PROGRAMS = 64
 """Compiled programs that are kept on disk, of 5 to 20 MB each."""

@@ -19,7 +19,7 @@ from limsim_jax.cli.maps import map_app
 from limsim_jax.cli.run import run
 from limsim_jax.cli.serve import serve_app
 
-# Tracing and reading make many objects that stay: looking for garbage among them takes a twentieth of a command.
+# Tracing and reading make many objects that stay: garbage among them is looked for less often.
 gc.set_threshold(100_000, 50, 50)
 
 # XLA logs an error for every program that it loads from its own cache on a CPU; nothing is wrong.

@@ -71,7 +71,7 @@ from limsim_jax.types import Config, Scenario, State
 _SHARE_OF_MEMORY = 0.25
 _TEMPORARIES = 12  # memory of a running world, in units of its arrays
 _WORLDS = {"cpu": 10, "gpu": 2000, "tpu": 2000}
-"""Worlds per device and call, if memory allows. On CPUs more are hardly faster, and few seeds wait for them."""
+"""Worlds per device and call, if memory allows: on CPUs more are hardly faster, and few seeds wait."""
 
 _LEAST = {"cpu": 20}
 """Worlds per call at least, so that machines of one and of two cores make the same rows."""
