@@ -1,24 +1,16 @@
-"""Host-side basics: whole files, the cache folder, values kept there, a pause of the garbage collector."""
+"""Host-side basics: files that are written whole, the cache folder, a pause of the garbage collector."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import gc
-import hashlib
 import os
-import pickle
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar
 
 import platformdirs
-
-Value = TypeVar("Value")
-
-VALUES = 1000
-"""Small values that are kept on disk."""
 
 
 def write_whole(path: str | Path, data: bytes | str) -> None:
@@ -71,33 +63,6 @@ def cache_directory() -> Path:
     if own := os.environ.get("LIMSIM_JAX_CACHE"):
         return Path(own)
     return platformdirs.user_cache_path("limsim_jax", appauthor=False)
-
-
-def remembered(name: str | None, make: Callable[[], Value]) -> Value:
-    """What `make` returns, or has returned before.
-
-    Args:
-      name: all that the value depends on, versions of code included; None: it is made anew.
-      make: takes long; what it returns is small and can be pickled.
-    """
-    if name is None:
-        return make()
-    path = cache_directory() / "values" / hashlib.sha256(name.encode()).hexdigest()[:32]
-    with contextlib.suppress(Exception):  # not there, or damaged
-        return pickle.loads(path.read_bytes())
-    value = make()
-    with contextlib.suppress(OSError):  # a full disk
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, pickle.dumps(value))
-        forget_oldest(path.parent, VALUES)
-    return value
-
-
-def forget_oldest(folder: Path, most: int) -> None:
-    """Remove all but the files of a folder that were used last."""
-    paths = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
-    for path in paths[most:]:
-        path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -27,7 +27,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int
 
-from limsim_jax.files import cache_directory, forget_oldest, write_whole
+from limsim_jax.files import cache_directory, write_whole
 
 Tree = TypeVar("Tree")
 
@@ -285,7 +285,7 @@ def keep_program(name: str | None, program: Any) -> Any:
         shardings = jax.tree.leaves((program.input_shardings, program.output_shardings))
         devices = max((len(x.device_set) for x in shardings), default=1)
         write_whole(path, pickle.dumps((devices, *serialize_executable.serialize(program))))
-        forget_oldest(path.parent, PROGRAMS)
+        _forget(path.parent)
     return program
 
 
@@ -300,3 +300,10 @@ def _program_path(name: str) -> Path:
     ]  # fmt: skip
     key = hashlib.sha256(repr((name, settings)).encode()).hexdigest()[:32]
     return Path(config["jax_compilation_cache_dir"]) / "limsim_jax" / f"{key}.bin"
+
+
+def _forget(folder: Path) -> None:
+    """Remove the programs that were not used for the longest time."""
+    paths = sorted(folder.glob("*.bin"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in paths[PROGRAMS:]:
+        path.unlink(missing_ok=True)

@@ -126,7 +126,7 @@ def comes_near(
 
     The circles around their bodies meet: of all others, boxes do not.
     """
-    place, motion = box[:, :2] - box[slot, :2], velocity - velocity[slot]
+    place, motion = box[:, :2] - box[slot, None, :2], velocity - velocity[slot, None]
     square = jnp.sum(motion * motion, -1)
     nearest = safe_divide(-jnp.sum(place * motion, -1), square)
     apart = place + motion * jnp.clip(nearest, 0, COURSE)[:, None]

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import limsim_jax
-from limsim_jax.files import remembered
 from limsim_jax.maps import bundled_maps
+from limsim_jax.maps import cache as kept_on_disk
 from limsim_jax.maps.lane_map import LaneMap
 from limsim_jax.maps.map import Map
 from limsim_jax.maps.network import Network
@@ -151,7 +151,7 @@ class Episodes:
         if sumo is not None:
             drawn += sumo.tables
         sampling = None if sumo is not None and sumo.random else describe_program(source, *drawn)
-        self.world_bytes = remembered(sampling and f"bytes of a world {sampling}", self._memory)
+        self.world_bytes = self._memory(sampling)
         self.chunk = self._chunk() if chunk is None else chunk
         run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
         names = sampling, describe_program(source, replace(run, horizon=1.0))  # programs run for any time
@@ -322,10 +322,19 @@ class Episodes:
         )  # fmt: skip
         return world if self._sumo is None else with_schedule(world, self._sumo.schedule(key))
 
-    def _memory(self) -> int:
-        """Bytes that one more world needs: its arrays at the start, and temporaries in proportion."""
-        scenario = jax.eval_shape(self.sample, jax.random.key(0))
-        return _TEMPORARIES * sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(scenario))
+    def _memory(self, sampling: str | None) -> int:
+        """Bytes that one more world needs: its arrays at the start, and temporaries in proportion.
+
+        `sampling`: all that they depend on. Tracing takes half a second, so their size is kept on disk.
+        """
+        name = None if sampling is None else kept_on_disk.key("world", sampling)
+        size = None if name is None else kept_on_disk.load(name)
+        if size is None:
+            arrays = jax.tree.leaves(jax.eval_shape(self.sample, jax.random.key(0)))
+            size = sum(math.prod(x.shape) * x.dtype.itemsize for x in arrays)
+            if name is not None:
+                kept_on_disk.store(name, size)
+        return _TEMPORARIES * size
 
     def _chunk(self) -> int:
         device = jax.local_devices()[0]

@@ -9,7 +9,7 @@ import pytest
 from traffic_worlds import bundled, motorway, overlap, scattered, state_of
 
 from limsim_jax.maps.lane_map import NO_LANE, pose, width
-from limsim_jax.metrics.course import _EVERY, COURSE, Aside, OnLanes, aside, course
+from limsim_jax.metrics.course import _EVERY, COURSE, Aside, OnLanes, aside, comes_near, course
 from limsim_jax.metrics.safety import NO_GAP, NONE, encounter, ttc_2d
 from limsim_jax.traffic.lane_change import LaneChoice, start
 from limsim_jax.traffic.motion import advance, boxes
@@ -94,6 +94,30 @@ def test_bodies_meet_where_a_loop_along_their_lanes_finds_it(name):
                     met += sure >= 0
                 ambiguous += sure != maybe
     assert met > 5 and ambiguous < 10
+
+
+def test_only_vehicles_that_are_near_are_looked_at():
+    """Those that may touch the ego on straight lines; whoever is not asked for counts as never met."""
+    lane_map, vehicles = bundled("roundabout")[1], vehicles_of("roundabout", 0)
+    rng = np.random.default_rng(0)
+    velocity = jnp.asarray(rng.normal(0, 9, (N, 2)), jnp.float32)
+    nobody, left_out, passed_by = jnp.arange(N) < 0, 0, 0
+    for slot in map(jnp.int32, range(0, N, 5)):
+        near = comes_near(slot, vehicles.box, velocity)
+        apart = vehicles.box.at[:, :2].multiply(2.5)  # a map on which some are far
+        far = comes_near(slot, apart, velocity)
+        for box, found in ((vehicles.box, near), (apart, far)):
+            touch = ttc_2d(encounter(box[slot], velocity[slot], box, velocity)) <= COURSE
+            assert not (touch & ~found).any()
+        passed_by += int((~far).sum())
+        whole, some = seen(lane_map, slot, vehicles), seen(lane_map, slot, vehicles, near)
+        np.testing.assert_array_equal(some.meets[near], whole.meets[near])
+        known = vehicles.lane != NO_LANE
+        assert (some.meets[~near & known] == NONE).all()
+        left_out += int((whole.meets[~near & known] < NONE).sum())
+        assert (seen(lane_map, slot, vehicles, nobody).meets[known] == NONE).all()
+        np.testing.assert_array_equal(some.follows, whole.follows)
+    assert left_out > 0 and passed_by > N
 
 
 def test_a_turn_past_a_waiting_vehicle_is_no_course_to_meet():
