@@ -38,7 +38,7 @@ from limsim_jax.maps.network import LaneType, Network
 from limsim_jax.maps.route_table import RouteTable
 from limsim_jax.maps.signal_table import SignalTable
 from limsim_jax.numerics import safe_divide, safe_sqrt
-from limsim_jax.xla import computed_once
+from limsim_jax.xla import computed_once, mapped_like
 
 if TYPE_CHECKING:
     from limsim_jax.maps.scenery import Scenery
@@ -442,13 +442,18 @@ def _search(
 
     Between two places that point at each other (the legs of a kink) a step that leaves them is halved.
     """
-    behind, ahead = jnp.full_like(s, low), jnp.full_like(s, high)
-    for _ in range(steps):
+
+    def once(_: Int[Array, ""], found: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        s, behind, ahead = found
         step = _newton_step(_curve(lane_map, *_locate(lane_map, lane, s)), x, y)
         behind, ahead = jnp.where(step > 0, s, behind), jnp.where(step < 0, s, ahead)
         there = jnp.clip(s + step, low, high)
-        s = jnp.where((there >= behind) & (there <= ahead), there, (behind + ahead) / 2)
-    return s
+        return jnp.where((there >= behind) & (there <= ahead), there, (behind + ahead) / 2), behind, ahead
+
+    s = jnp.broadcast_to(s, jnp.broadcast_shapes(*(jnp.shape(v) for v in (lane, s, low, high, x, y))))
+    limits = jnp.full_like(s, low), jnp.full_like(s, high)
+    # not unrolled: half of the programs that search would be this
+    return lax.fori_loop(0, steps, once, mapped_like(s + x, (s, *limits)))[0]
 
 
 def cell_row(ix: Any, iy: Any, size: int) -> Any:
