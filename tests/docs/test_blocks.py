@@ -50,7 +50,8 @@ def folder(tmp_path, monkeypatch):
         short[name] = tmp_path / ".bundled" / path.name
         short[name].write_text(re.sub(r"(?m)^horizon = .*$", f"horizon = {HORIZON}", path.read_text()))
     monkeypatch.setattr(experiment, "bundled_experiments", lambda: short)
-    monkeypatch.setitem(episode._CHUNKS, "cpu", SEEDS)
+    monkeypatch.setitem(episode._WORLDS, "cpu", 1)
+    monkeypatch.setitem(episode._LEAST, "cpu", SEEDS)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
