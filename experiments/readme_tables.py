@@ -234,6 +234,34 @@ def sweep_speed(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def sweep_profile(result: list[dict[str, Any]]) -> str:
+    """Where the time of a sweep goes."""
+    one = result[0]
+
+    def row(label: str, cell: Callable[[dict[str, Any]], str]) -> str:
+        return f"| {label} | {' | '.join(map(cell, result))} |"
+
+    def head(label: str) -> list[str]:
+        return [row(label, lambda one: one["experiment"]), f"|---|{'---:|' * len(result)}"]
+
+    def spent(part: str) -> Callable[[dict[str, Any]], str]:
+        return lambda one: f"{one['parts'][part]['ms']:.2f} ({one['parts'][part]['kernels']:.0f})"
+
+    def took(stage: str) -> Callable[[dict[str, Any]], str]:
+        return lambda one: f"{one['stages_s'][stage]:.1f}"
+
+    return "\n".join(
+        [
+            *head("part of a run, ms per decision"),
+            *(row(part, spent(part)) for part in one["parts"]),
+            row("all, without the profiler", lambda one: f"{one['ms_per_decision']:.2f}"),
+            "", f"{one['worlds']} worlds on one core; in brackets, kernels that run.", "",
+            *head("stage of compiling, s"),
+            *(row(stage, took(stage)) for stage in one["stages_s"]),
+        ]
+    )  # fmt: skip
+
+
 def calibration(result: dict[str, Any]) -> str:
     """How well drivers can be fitted."""
     rows = [
@@ -481,6 +509,7 @@ TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "sensor_speed": sensor_speed,
     "soundness": soundness,
     "sweep_speed": sweep_speed,
+    "sweep_profile": sweep_profile,
     "traffic_against_sumo": traffic_sumo,
     "traffic_speed": traffic_speed,
 }

@@ -154,7 +154,7 @@ def advance(
     Returns:
       The state, the distance that each travelled (m), and whether it has left at the end of its goal.
     """
-    a = jnp.where(state.active, a, 0)
+    a = computed_once(jnp.where(state.active, a, 0))
     v, dx = computed_once(ballistic(state.v, a, config.dt))
     realised = (v - state.v) / config.dt
     hard = realised < -state.driver.b_max - 0.01
