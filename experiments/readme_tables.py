@@ -234,15 +234,34 @@ def sweep_speed(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
-def sweep_profile(result: list[dict[str, Any]]) -> str:
+def scaling(result: dict[str, Any]) -> str:
+    """What worlds, slots and workers cost."""
+    rows = [
+        "| map | worlds | slots | slot-updates/s | us of a core per slot and step | peak memory, MB |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    for r in [*result["worlds"], *result["slots"]]:
+        rows.append(
+            f"| {r['map']} | {r['worlds']:,} | {r['slots']:,} | {r['slot_updates_per_s']:,.0f} "
+            f"| {r['us_per_slot']:.2f} | {r['peak_memory_mb']:,} |"
+        )
+    one = result["workers"][0]
+    rows += ["", "| Ray workers | worlds | s | times as fast |", "|---:|---:|---:|---:|"]
+    for r in result["workers"]:
+        rows.append(f"| {r['workers']} | {r['seeds']:,} | {r['s']:.1f} | {one['s'] / r['s']:.2f} |")
+    return "\n".join(rows)
+
+
+def sweep_profile(result: dict[str, list[dict[str, Any]]]) -> str:
     """Where the time of a sweep goes."""
-    one = result[0]
+    found = result["experiments"]
+    one = found[0]
 
     def row(label: str, cell: Callable[[dict[str, Any]], str]) -> str:
-        return f"| {label} | {' | '.join(map(cell, result))} |"
+        return f"| {label} | {' | '.join(map(cell, found))} |"
 
     def head(label: str) -> list[str]:
-        return [row(label, lambda one: one["experiment"]), f"|---|{'---:|' * len(result)}"]
+        return [row(label, lambda one: one["experiment"]), f"|---|{'---:|' * len(found)}"]
 
     def spent(part: str) -> Callable[[dict[str, Any]], str]:
         return lambda one: f"{one['parts'][part]['ms']:.2f} ({one['parts'][part]['kernels']:.0f})"
@@ -508,6 +527,7 @@ TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "random_maps": random_maps,
     "sensor_speed": sensor_speed,
     "soundness": soundness,
+    "scaling": scaling,
     "sweep_speed": sweep_speed,
     "sweep_profile": sweep_profile,
     "traffic_against_sumo": traffic_sumo,

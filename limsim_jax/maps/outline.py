@@ -6,8 +6,9 @@ coordinates of the file, and draws nothing itself.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -150,8 +151,12 @@ def outline(lane: Lane) -> Outline:
     return Outline(lane, s, road_s, heading, centre, centre + half, centre - half)
 
 
-def outlines(network: Network) -> dict[str, Outline]:
-    """Outlines of all lanes by lane id. Raises `MapError` if the map has no lanes."""
+@functools.lru_cache(maxsize=2)
+def outlines(network: Network) -> Mapping[str, Outline]:
+    """Outlines of all lanes by lane id; those of the last networks are kept, for a report draws one often.
+
+    Raises `MapError` if the map has no lanes.
+    """
     if not network.lanes:
         raise MapError("nothing to draw: the map has no lanes", file=network.source)
     return {id_: outline(lane) for id_, lane in network.lanes.items()}
@@ -182,7 +187,7 @@ def surface_rank(lane: Lane) -> tuple[bool, bool, bool]:
     return lane.drivable, lane.junction is None, lane.type is not LaneType.NONE
 
 
-def view(network: Network, shapes: dict[str, Outline], bounds: Bounds | None) -> Bounds:
+def view(network: Network, shapes: Mapping[str, Outline], bounds: Bounds | None) -> Bounds:
     """The rectangle to show: `bounds`, or all lanes, lights and signs with a margin.
 
     Raises `MapError` if `bounds` are no rectangle, or show no lane.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import jax.numpy as jnp
 import numpy as np
@@ -222,7 +222,7 @@ def _paint(canvas: _Canvas, network: Network) -> None:
             canvas.line(ends[k : k + 2], STOP_WIDTH, Label.STOP_LINE)
 
 
-def _pavements(network: Network, shapes: dict[str, Outline]) -> Iterator[tuple[list[Floats], str]]:
+def _pavements(network: Network, shapes: Mapping[str, Outline]) -> Iterator[tuple[list[Floats], str]]:
     """Ground of junctions between their lanes.
 
     Outlines, each with the lane before which it is painted.
@@ -248,7 +248,7 @@ def _pavements(network: Network, shapes: dict[str, Outline]) -> Iterator[tuple[l
         yield holes + found, first
 
 
-def _bars(network: Network, shapes: dict[str, Outline]) -> Iterator[tuple[Floats, bool]]:
+def _bars(network: Network, shapes: Mapping[str, Outline]) -> Iterator[tuple[Floats, bool]]:
     """Lines `[2, 2]` where traffic stops, and whether they are broken.
 
     They are where it yields.

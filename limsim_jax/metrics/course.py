@@ -122,9 +122,9 @@ def course(
 def comes_near(
     slot: Int[Array, ""], box: Float[Array, "N 5"], velocity: Float[Array, "N 2"]
 ) -> Bool[Array, " N"]:
-    """Vehicles that may touch that in `slot` within `COURSE` s if all keep their velocities.
+    """Vehicles that may touch the one in `slot` on straight lines.
 
-    The circles around their bodies meet: of all others, boxes do not.
+    All keep their velocities for `COURSE` s. The circles around their bodies meet: of all others, boxes do not.
     """
     place, motion = box[:, :2] - box[slot, None, :2], velocity - velocity[slot, None]
     square = jnp.sum(motion * motion, -1)

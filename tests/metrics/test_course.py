@@ -97,7 +97,7 @@ def test_bodies_meet_where_a_loop_along_their_lanes_finds_it(name):
 
 
 def test_only_vehicles_that_are_near_are_looked_at():
-    """Those that may touch the ego on straight lines; whoever is not asked for counts as never met."""
+    """Those that may touch the ego on straight lines; the others count as never met."""
     lane_map, vehicles = bundled("roundabout")[1], vehicles_of("roundabout", 0)
     rng = np.random.default_rng(0)
     velocity = jnp.asarray(rng.normal(0, 9, (N, 2)), jnp.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +41,7 @@ class Page:
 
 
 def plan_page(
-    network: Network, shapes: dict[str, Outline], bounds: Bounds | None, size: tuple[float, float] | None
+    network: Network, shapes: Mapping[str, Outline], bounds: Bounds | None, size: tuple[float, float] | None
 ) -> Page:
     """Arrange a map on a page.
 
@@ -89,7 +90,7 @@ def plan_page(
 
 
 def strips(
-    shapes: dict[str, Outline], view: Bounds, room: tuple[float, float]
+    shapes: Mapping[str, Outline], view: Bounds, room: tuple[float, float]
 ) -> tuple[list[Bounds], bool, float]:
     """Cut a view into strips along its longer side.
 
@@ -151,7 +152,7 @@ def strips(
     return best, wide, scale
 
 
-def detail_windows(network: Network, shapes: dict[str, Outline], count: int, most: float) -> list[Bounds]:
+def detail_windows(network: Network, shapes: Mapping[str, Outline], count: int, most: float) -> list[Bounds]:
     """At most `count` square windows on details, which do not overlap.
 
     The busiest junctions come first, then lanes of varying width. `most` is the side (m) from which on a

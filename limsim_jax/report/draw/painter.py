@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,7 +68,7 @@ class Painter:
         self,
         ax: Axes,
         network: Network,
-        shapes: dict[str, Outline],
+        shapes: Mapping[str, Outline],
         storeys: dict[str, int],
         bounds: Bounds,
         name: str = "",
