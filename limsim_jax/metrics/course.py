@@ -124,7 +124,7 @@ def comes_near(
 ) -> Bool[Array, " N"]:
     """Vehicles that may touch the one in `slot` on straight lines.
 
-    All keep their velocities for `COURSE` s. The circles around their bodies meet: of all others, boxes do not.
+    All keep their velocities for `COURSE` s. Circles around their bodies meet; boxes of all others do not.
     """
     place, motion = box[:, :2] - box[slot, None, :2], velocity - velocity[slot, None]
     square = jnp.sum(motion * motion, -1)
