@@ -556,8 +556,8 @@ pasubio_tls.add.xml and every fourth vehicle.
   slower (391891458 of ingolstadt1: the queue behind it is what waits outside).
 - SUMO's drivers choose the lane that leads on farthest, and so use all lanes of the roundabout. Ours stay on
   the lane of their exit, four fifths of them on the outermost, and wait for one another.
-- limsim_bigInter jams in some of our runs, when vehicles that have entered on a gap meet others inside: seven
-  of them then block each other. This happens to SUMO's drivers as well, and SUMO teleports them.
+- limsim_bigInter jams in runs of SUMO: vehicles that have entered on a gap meet others inside, and SUMO
+  teleports some of them. Ours enter no junction that they cannot leave.
 - ingolstadt1 and limsim_town05 count as gridlocked as soon as one vehicle stands for 120 s, which happens
   in minor arms, behind long red phases and missed turns; traffic as a whole goes on.
 - SUMO looks for collisions along lanes. Ours compares bodies, so it also finds vehicles that touch side by
