@@ -135,7 +135,7 @@ def measure(name: str, decisions: int) -> dict[str, Any]:
     text, stages = compiled(episodes)
     named, instructions = kernels(text)
     worlds = episodes.worlds
-    state, _ = worlds.advance(worlds.start(range(WORLDS)), FILLING)
+    state, _ = jax.block_until_ready(worlds.advance(worlds.start(range(WORLDS)), FILLING))
     begin = time.perf_counter()
     state, _ = jax.block_until_ready(worlds.advance(state, decisions))
     seconds = time.perf_counter() - begin

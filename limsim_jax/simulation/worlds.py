@@ -236,7 +236,9 @@ class Worlds:
             some = min(self.chunk, count - first)
             which = np.minimum(np.arange(first, first + self.chunk), count - 1)
             chunk = worlds if count == self.chunk else jax.tree.map(lambda x: x[which], worlds)  # noqa: B023
-            result = run(jax.device_put(chunk, there), some)
+            if not all(getattr(x, "sharding", None) == there for x in jax.tree.leaves(chunk)):
+                chunk = jax.device_put(chunk, there)
+            result = run(chunk, some)
             parts.append(jax.tree.map(lambda x: x[:some], result))  # noqa: B023
         return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
