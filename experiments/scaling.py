@@ -1,6 +1,6 @@
 """What worlds, slots and workers cost as there are more of them.
 
-    python experiments/scaling.py [--seconds 60] [--seeds 2000]
+    python experiments/scaling.py [--seconds 60] [--seeds 1000]
 
 Traffic alone for worlds and slots; sweeps with all metrics for workers, which are processes of one core
 each under Ray, on this machine. Writes experiments/results/scaling.json and .md.
@@ -78,7 +78,7 @@ def main() -> None:
     """Parse the command line, run, write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--seeds", type=int, default=2000)
+    parser.add_argument("--seeds", type=int, default=1000)
     options = parser.parse_args()
     found = {
         "worlds": [cost(*case, options.seconds) for case in WORLDS],
