@@ -35,7 +35,7 @@ WORLDS, FILLING = 25, 60
 """Worlds of the chunk, and decisions before the first one that counts."""
 
 PARTS = (
-    ("metrics", ("ego_metrics", "course", "aside", "traffic_metrics")),
+    ("metrics", ("ego_metrics", "course", "aside")),
     ("contacts of bodies", ("contacts",)),
     ("right of way", ("right_of_way", "lights")),
     ("neighbours", ("neighbors", "sort_vehicles", "beside_leaders", "look_ahead")),
@@ -49,11 +49,10 @@ PARTS = (
 """Parts of a sweep and named scopes of them; the first that a kernel lies in counts."""
 
 STAGES = (
-    ("HLO passes", ("PjRtCpuClient::Compile",)),
     ("emission", ("ThunkEmitter::EmitEntryComputation", "ThunkEmitter::ConsumeKernels")),
     ("machine code", ("JitCompiler::Compile",)),
 )
-"""Stages of XLA and events of its profile; passes are what the other stages leave."""
+"""Stages of XLA and events of its profile; passes over the program are what these leave."""
 
 
 def part_of(scopes: str) -> str:
@@ -107,8 +106,8 @@ def compiled(episodes: Episodes) -> tuple[str, dict[str, float]]:
         stages["lower"] = time.perf_counter() - begin
         worlds._advance, seconds, spent, _ = profiled(lowered.compile)
         worlds._start = start.compile()
-    found = {stage: sum(spent[name] for name in names) / 1e9 for stage, names in STAGES[1:]}
-    return worlds._advance.as_text(), stages | {STAGES[0][0]: seconds - sum(found.values())} | found
+    found = {stage: sum(spent[name] for name in names) / 1e9 for stage, names in STAGES}
+    return worlds._advance.as_text(), stages | {"HLO passes": seconds - sum(found.values())} | found
 
 
 def kernels(text: str) -> tuple[dict[str, str], Counter[str]]:

@@ -19,9 +19,6 @@ from limsim_jax.cli.maps import map_app
 from limsim_jax.cli.run import run
 from limsim_jax.cli.serve import serve_app
 
-# Tracing and reading make many objects that stay: garbage among them is looked for less often.
-gc.set_threshold(100_000, 50, 50)
-
 # XLA logs an error for every program that it loads from its own cache on a CPU; nothing is wrong.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
@@ -47,6 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command (default: that of the process) and return its exit code."""
     from limsim_jax.maps.network import MapError
 
+    # tracing and reading make many objects that stay: garbage among them is looked for less often
+    gc.set_threshold(100_000, 50, 50)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
