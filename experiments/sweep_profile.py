@@ -14,7 +14,7 @@ import json
 import re
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -92,22 +92,38 @@ def profiled(run: Callable[[], Any]) -> tuple[Any, float, Counter[str], Counter[
     return result, seconds, spent, number
 
 
-def compiled(episodes: Episodes) -> tuple[str, dict[str, float]]:
-    """Make the program of a chunk: its text, and s of every stage."""
+def compiled(episodes: Episodes) -> tuple[list[str], dict[str, float]]:
+    """Make the programs of a chunk, one after the other: their texts, and s of every stage."""
     worlds: Any = episodes.worlds
-    begin = time.perf_counter()
-    with no_garbage_collection(), without_compilation_cache():
-        start = worlds._start_jit.lower(worlds.lane_map, worlds._inputs(np.zeros(worlds.chunk, np.int32)))
-        stages = {"trace and lower the start": time.perf_counter() - begin}
+    stages: dict[str, Any] = defaultdict(float)
+    none, lane_map = np.int32(0), worlds.lane_map
+
+    def made(program: Any, *of: Any) -> Any:
         begin = time.perf_counter()
-        traced = worlds._advance_jit.trace((worlds.lane_map, np.int32(0)), start.out_info)
-        stages["trace"], begin = time.perf_counter() - begin, time.perf_counter()
+        traced = program.trace(*of)
+        stages["trace"] += time.perf_counter() - begin
+        begin = time.perf_counter()
         lowered = traced.lower()
-        stages["lower"] = time.perf_counter() - begin
-        worlds._advance, seconds, spent, _ = profiled(lowered.compile)
+        stages["lower"] += time.perf_counter() - begin
+        found, seconds, spent, _ = profiled(lowered.compile)
+        parts = {stage: sum(spent[name] for name in names) / 1e9 for stage, names in STAGES}
+        parts["HLO passes"] = seconds - sum(parts.values())
+        for stage, took in parts.items():
+            stages[stage] += took
+        return found
+
+    with no_garbage_collection(), without_compilation_cache():
+        begin = time.perf_counter()
+        start = worlds._start_jit.lower(lane_map, worlds._inputs(np.zeros(worlds.chunk, np.int32)))
+        before = {"trace and lower the start": time.perf_counter() - begin}
         worlds._start = start.compile()
-    found = {stage: sum(spent[name] for name in names) / 1e9 for stage, names in STAGES}
-    return worlds._advance.as_text(), stages | {"HLO passes": seconds - sum(found.values())} | found
+        begun, _ = start.out_info
+        carry = begun.carry._replace(measured=None)
+        worlds._drive = made(worlds._drive_jit, (lane_map, none), (begun.schedule, begun.key), carry)
+        seen = worlds._drive.out_info[1].tree._replace(trace=None)
+        shared = lane_map, none, np.bool_(False)
+        worlds._look = made(worlds._look_jit, shared, (begun.schedule, seen), begun.carry.measured)
+    return [worlds._drive.as_text(), worlds._look.as_text()], before | stages
 
 
 def kernels(text: str) -> tuple[dict[str, str], Counter[str]]:
@@ -131,19 +147,36 @@ def kernels(text: str) -> tuple[dict[str, str], Counter[str]]:
 def measure(name: str, decisions: int) -> dict[str, Any]:
     """Stages of compiling, and ms per decision, kernels and instructions by part."""
     episodes = load_experiments(name)[0].episodes(chunk=WORLDS)
-    text, stages = compiled(episodes)
-    named, instructions = kernels(text)
-    worlds = episodes.worlds
+    texts, stages = compiled(episodes)
+    worlds: Any = episodes.worlds
     state, _ = jax.block_until_ready(worlds.advance(worlds.start(range(WORLDS)), FILLING))
     begin = time.perf_counter()
     state, _ = jax.block_until_ready(worlds.advance(state, decisions))
     seconds = time.perf_counter() - begin
-    _, _, spent, number = profiled(lambda: jax.block_until_ready(worlds.advance(state, decisions)))
-    parts = {part: {"ms": 0.0, "kernels": 0.0, "instructions": instructions[part]} for part, _ in PARTS}
-    for kernel, operation in named.items():
-        part = parts[part_of(operation)]
-        part["ms"] += spent[kernel] / 1e6 / decisions
-        part["kernels"] += number[kernel] / decisions
+    parts: dict[str, Any] = {part: {"ms": 0.0, "kernels": 0.0, "instructions": 0} for part, _ in PARTS}
+    schedule, key, carry = state
+    some = min(decisions, worlds.rollout.kept(carry.state))
+    shared, of = (worlds.lane_map, np.int32(some)), carry._replace(measured=None)
+
+    def drive() -> Any:
+        return jax.block_until_ready(worlds._drive(shared, (schedule, key), of))
+
+    def look() -> Any:
+        return jax.block_until_ready(
+            worlds._look((*shared, np.bool_(False)), (schedule, seen), carry.measured)
+        )
+
+    (_, kept), _, *driven = profiled(drive)
+    seen = kept.tree._replace(trace=None)
+    _, _, *looked = profiled(look)
+    for text, (spent, number) in zip(texts, (driven, looked), strict=True):
+        named, instructions = kernels(text)
+        for part, _ in PARTS:
+            parts[part]["instructions"] += instructions[part]
+        for kernel, operation in named.items():
+            here = parts[part_of(operation)]
+            here["ms"] += spent[kernel] / 1e6 / some
+            here["kernels"] += number[kernel] / some
     slots, config = episodes.experiment.slots, episodes.rollout.config
     updates = WORLDS * slots * config.decision_every
     return {

@@ -32,10 +32,10 @@ class Changes:
     A `simulation.rollout.Measure`; every vehicle counts once.
     """
 
-    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> tuple[Any, None]:
         """The count before any vehicle is seen."""
         none = jnp.zeros((3, *state.active.shape), bool)
-        return state.entered, none, jnp.zeros(3, jnp.int32)
+        return (state.entered, none, jnp.zeros(3, jnp.int32)), None
 
     def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
         """The vehicle in each slot, and which of the three it does."""
@@ -45,7 +45,9 @@ class Changes:
         each = jnp.stack([must, must & (state.v < STANDS), missed])
         return jnp.where(state.active, state.entered, -1), state.active & each
 
-    def update(self, config: Config, lane_map: LaneMap, carry: Any, records: Any) -> Any:
+    def update(
+        self, config: Config, lane_map: LaneMap, carry: Any, records: Any, *, start: Any = False
+    ) -> Any:
         """Count vehicles that were not counted before."""
 
         def step(carry: Any, record: Any) -> tuple[Any, None]:
@@ -105,16 +107,18 @@ class Watch:
         against = both & yields & moves
         return both, against | against.ravel()[self.mirror]
 
-    def init(self, config: Config, lane_map: LaneMap, state: State) -> Any:
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> tuple[Any, None]:
         """The count before any vehicles meet."""
         met = jnp.zeros(2, jnp.int32)
-        return self._pairs(lane_map, state), met, self.changes.init(config, lane_map, state)
+        return (self._pairs(lane_map, state), met, self.changes.init(config, lane_map, state)[0]), None
 
     def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> Any:
         """Pairs after a step, and the record of `Changes`."""
         return self._pairs(lane_map, tick.state), self.changes.record(config, lane_map, tick)
 
-    def update(self, config: Config, lane_map: LaneMap, carry: Any, records: Any) -> Any:
+    def update(
+        self, config: Config, lane_map: LaneMap, carry: Any, records: Any, *, start: Any = False
+    ) -> Any:
         """Count pairs when they begin, and vehicles once."""
         (before, met, changes), (pairs, vehicles) = carry, records
         begun = [

@@ -215,21 +215,53 @@ def test_jax_gets_its_cache_back_when_the_last_thread_is_done():
 
 
 def test_threads_that_want_the_same_program_compile_it_once(folder):
-    compiled = []
+    traced = []
 
-    def compile_it(name: str):
-        compiled.append(name)
+    def trace_it(name: str):
+        first = not traced
+        traced.append(name)
         time.sleep(0.05)
-        return jax.jit(lambda x: x + len(name)).lower(1.0).compile()
+        if first:
+            raise ValueError("the first one fails")
+        return jax.jit(lambda x: x + len(name)).lower(1.0)
+
+    def program(name: str):
+        try:
+            shapes, get = xla.begin_program(name, lambda: trace_it(name), compiling)
+        except ValueError:
+            shapes, get = xla.begin_program(name, lambda: trace_it(name), compiling)
+        assert shapes.shape == ()
+        return get()
 
     names = ["one", "three", "one", "three", "one"]
-    with ThreadPoolExecutor(5) as pool:
-        found = list(pool.map(lambda name: xla.shared_program(name, lambda: compile_it(name)), names))
-    assert sorted(compiled) == ["one", "three"]
-    assert [float(program(1.0)) for program in found] == [4, 6, 4, 6, 4]
-    for _ in range(2):
-        xla.shared_program(None, lambda: compile_it("apart"))
-    assert compiled[2:] == ["apart", "apart"]
+    with ThreadPoolExecutor(5) as pool, ThreadPoolExecutor(2) as compiling:
+        found = list(pool.map(program, names))
+        assert sorted(traced[1:]) == ["one", "three"]
+        assert [float(one(1.0)) for one in found] == [4, 6, 4, 6, 4]
+        for _ in range(2):
+            xla.begin_program(None, lambda: trace_it("apart"), compiling)[1]()
+    assert traced[3:] == ["apart", "apart"]
+
+
+def test_rows_of_a_batch_are_slices_and_not_loops():
+    x = np.arange(24, dtype=np.float32).reshape(2, 4, 3)  # worlds, rows, values
+    new = -np.arange(6, dtype=np.float32).reshape(2, 3)
+
+    @jax.jit
+    def both(x, new, i):
+        taken = jax.vmap(xla.row, (0, None))({"x": x}, i)["x"]
+        put_one = jax.vmap(xla.with_row, (0, None, None))(x, i, new[0])
+        return taken, jax.vmap(xla.with_row, (0, None, 0))(x, i, new), put_one
+
+    taken, replaced, same = both(x, new, np.int32(2))
+    np.testing.assert_array_equal(taken, x[:, 2])
+    want = x.copy()
+    want[:, 2] = new
+    np.testing.assert_array_equal(replaced, want)
+    want[:, 2] = new[0]
+    np.testing.assert_array_equal(same, want)
+    text = both.lower(x, new, np.int32(2)).as_text()
+    assert "dynamic_slice" in text and "gather" not in text and "scatter" not in text
 
 
 def test_programs_that_were_not_used_for_long_are_forgotten(folder, monkeypatch):

@@ -290,7 +290,7 @@ class Env:
 
     def _look(self, state: State, schedule: Schedule, sight: Any, key: Key[Array, ""]) -> tuple[Any, Any]:
         """The observation of the egos, and the memory of their view."""
-        lanes = lanes_now(self.config, self.lanes, schedule, state)
+        lanes = lanes_now(self.config, self.lanes, schedule, state.step)
         if self._view is not None:
             now = jax.random.fold_in(key, state.step)
             seen, sight = self._view.look(self.config, lanes, state, sight, now)

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from cmaes import CMA
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from limsim_jax.files import write_whole
@@ -205,10 +205,10 @@ class TrafficFlow:
     detectors: tuple[tuple[int, float], ...] = ()
     begin: float = 0.0
 
-    def init(self, config: Config, lane_map: LaneMap, state: State) -> TrafficCarry:
-        """Before the first step."""
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> tuple[TrafficCarry, None]:
+        """Before the first step. The start does not count."""
         del lane_map
-        return TrafficMetrics(config.dt).init(state.lane.shape[0], len(self.detectors))
+        return TrafficMetrics(config.dt).init(state.lane.shape[0], len(self.detectors)), None
 
     def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> TrafficStep:
         """A physics step of the traffic."""
@@ -220,10 +220,16 @@ class TrafficFlow:
         )  # fmt: skip
 
     def update(
-        self, config: Config, lane_map: LaneMap, carry: TrafficCarry, records: TrafficStep
+        self,
+        config: Config,
+        lane_map: LaneMap,
+        carry: TrafficCarry,
+        records: TrafficStep,
+        *,
+        start: bool | Bool[Array, ""] = False,
     ) -> TrafficCarry:
         """The steps since the last decision."""
-        del lane_map
+        del lane_map, start
         metrics = TrafficMetrics(config.dt)
         lane, s = ([row[k] for row in self.detectors] for k in (0, 1))
         places = Detectors(jnp.asarray(lane, jnp.int32), jnp.asarray(s, jnp.float32))

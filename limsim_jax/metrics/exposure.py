@@ -82,12 +82,13 @@ class CountExposure:
     places: Places
     egos: int = 1
 
-    def init(self, config: Config, lane_map: LaneMap, state: State) -> ExposureCarry:
-        """Nothing counted."""
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> tuple[ExposureCarry, None]:
+        """Nothing counted. The start does not count."""
         slot = state.egos.slot[: self.egos]
         shape = self.egos, self.domain.size
         counted = Counted(jnp.zeros(shape, jnp.int32), jnp.full(shape, NEVER, jnp.int32))
-        return ExposureCarry(counted, state.goal[slot], state.active[slot], jnp.zeros(self.egos, bool))
+        over = jnp.zeros(self.egos, bool)
+        return ExposureCarry(counted, state.goal[slot], state.active[slot], over), None
 
     def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> Moment:
         """The egos after a physics step, `[E]`."""
@@ -108,9 +109,16 @@ class CountExposure:
         )
 
     def update(
-        self, config: Config, lane_map: LaneMap, carry: ExposureCarry, records: Moment
+        self,
+        config: Config,
+        lane_map: LaneMap,
+        carry: ExposureCarry,
+        records: Moment,
+        *,
+        start: bool | Bool[Array, ""] = False,
     ) -> ExposureCarry:
         """Count the steps since the last decision, `[decision_every, E]`."""
+        del start
 
         def one(carry: ExposureCarry, now: Moment) -> tuple[ExposureCarry, Bool[Array, " E"]]:
             counts = now.there & ~carry.over

@@ -35,8 +35,9 @@ from limsim_jax.metrics.safety import NONE, Rss
 from limsim_jax.metrics.step import EgoStep
 from limsim_jax.metrics.traffic import Detectors, TrafficCarry, TrafficMetrics, TrafficStep
 from limsim_jax.traffic.engine import Tick
-from limsim_jax.traffic.neighbors import other_lane
+from limsim_jax.traffic.neighbors import lanes_ahead, other_lane
 from limsim_jax.types import Config, State
+from limsim_jax.xla import row
 
 _COMMON = ("t", "box", "velocity", "b_max", "changing", "violation", "state")
 _PER_EGO: Any = EgoStep._make(None if name in _COMMON else 0 for name in EgoStep._fields)
@@ -108,8 +109,8 @@ class EvaluateEgo:
         """Unit and meaning of every column."""
         return {column.name: column.meaning for column in self.descriptions}
 
-    def init(self, config: Config, lane_map: LaneMap, state: State) -> MetricState:
-        """Everything as it is at the start.
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> tuple[MetricState, StepRecord]:
+        """Nothing measured yet, and the record of the start.
 
         Raises:
           ValueError: a world without this ego; an own metric whose memory changes or whose result is no
@@ -119,24 +120,21 @@ class EvaluateEgo:
         if self._last >= rows:
             raise ValueError(f"ego {self._last} is measured, but the world has {rows} egos")
         first = self._record(lane_map, at_start(config, lane_map, state))
-        any_ = jnp.ones(state.lane.shape[0], bool)
-        never = jnp.full(any_.shape, NONE)  # no paths are known yet
-        vehicles = any_, Course(meets=never, follows=~any_, leads=~any_)
+        later = jnp.full((state.lane.shape[0], lanes_ahead(config, lane_map)), NO_LANE)
+        first = first._replace(way=jnp.concatenate([first.way, later], 1))
 
-        def begin(step: EgoStep, stopped: Bool[Array, ""], goal: Int[Array, ""]) -> EgoState:
-            carry = EgoState(
+        def begin(step: EgoStep, goal: Int[Array, ""]) -> EgoState:
+            return EgoState(
                 metrics=self._begin(config, lane_map, step),
                 goal=goal,
                 lane=state.lane[step.slot],
                 stopped=jnp.zeros((), bool),
                 to_go=jnp.float32(0),
             )
-            return self._advance(config, lane_map, carry, step, stopped, goal, first.traffic, vehicles)
 
         _, traffic = self._metrics(config)
-        ego = self._each(begin, (_PER_EGO, 0, 0))(first.ego, first.stopped, first.goal)
-        slots = state.lane.shape[0]
-        return MetricState(ego, _flow(traffic, traffic.init(slots, 0), first.traffic))
+        ego = self._each(begin, (_PER_EGO, 0))(first.ego, first.goal)
+        return MetricState(ego, traffic.init(state.lane.shape[0], 0)), first
 
     def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> StepRecord:
         """What the metrics need to know of a physics step."""
@@ -149,18 +147,24 @@ class EvaluateEgo:
         )
 
     def update(
-        self, config: Config, lane_map: LaneMap, carry: MetricState, records: StepRecord
+        self,
+        config: Config,
+        lane_map: LaneMap,
+        carry: MetricState,
+        records: StepRecord,
+        *,
+        start: bool | Bool[Array, ""] = False,
     ) -> MetricState:
-        """Add the records since the last decision, `[decision_every, ...]`."""
-        relevant = self._each(lambda slot: paths(lane_map, slot, records), (0,))(records.ego.slot[0])
+        """Add the records of a decision, `[decision_every, ...]`, or of the start."""
+        relevant = self._each(lambda slot: paths(lane_map, slot, records, start), (0,))(records.ego.slot[0])
         _, traffic = self._metrics(config)
 
-        def one(carry: MetricState, record: StepRecord) -> tuple[MetricState, None]:
+        def one(carry: MetricState, record: StepRecord) -> MetricState:
             each = self._each(partial(self._advance, config, lane_map), (0, _PER_EGO, 0, 0, None, 0))
             ego = each(carry.ego, record.ego, record.stopped, record.goal, record.traffic, relevant)
-            return MetricState(ego, _flow(traffic, carry.traffic, record.traffic)), None
+            return MetricState(ego, _flow(traffic, carry.traffic, record.traffic))
 
-        return lax.scan(one, carry, records)[0]
+        return over_steps(one, carry, records, start)
 
     def result(self, config: Config, lane_map: LaneMap, carry: MetricState) -> dict[str, Measured]:
         """All columns of `units`."""
@@ -298,11 +302,11 @@ class EvaluateTraffic:
         """Unit and meaning of every column."""
         return {column.name: column.meaning for column in self.descriptions}
 
-    def init(self, config: Config, lane_map: LaneMap, state: State) -> TrafficCarry:
-        """Everything as it is at the start."""
-        metrics, still = TrafficMetrics(config.dt), jnp.zeros_like(state.s)
+    def init(self, config: Config, lane_map: LaneMap, state: State) -> tuple[TrafficCarry, TrafficStep]:
+        """Nothing measured yet, and the record of the start."""
+        still = jnp.zeros_like(state.s)
         first = traffic_step(state, still > 0, config.time(state.step), still)
-        return _flow(metrics, metrics.init(state.lane.shape[0], 0), first)
+        return TrafficMetrics(config.dt).init(state.lane.shape[0], 0), first
 
     def record(self, config: Config, lane_map: LaneMap, tick: Tick) -> TrafficStep:
         """What the metrics need to know of a physics step."""
@@ -310,30 +314,58 @@ class EvaluateTraffic:
         return step._replace(v_free=tick.decision.v0)
 
     def update(
-        self, config: Config, lane_map: LaneMap, carry: TrafficCarry, records: TrafficStep
+        self,
+        config: Config,
+        lane_map: LaneMap,
+        carry: TrafficCarry,
+        records: TrafficStep,
+        *,
+        start: bool | Bool[Array, ""] = False,
     ) -> TrafficCarry:
-        """Add the records since the last decision, `[decision_every, ...]`."""
-        metrics = TrafficMetrics(config.dt)
-        return lax.scan(lambda carry, step: (_flow(metrics, carry, step), None), carry, records)[0]
+        """Add the records of a decision, `[decision_every, ...]`, or of the start."""
+        return over_steps(partial(_flow, TrafficMetrics(config.dt)), carry, records, start)
 
     def result(self, config: Config, lane_map: LaneMap, carry: TrafficCarry) -> dict[str, Measured]:
         """All columns of `units`."""
         return _flow_result(TrafficMetrics(config.dt), lane_map, carry)
 
 
-def paths(lane_map: LaneMap, slot: Int[Array, ""], records: StepRecord) -> tuple[Bool[Array, " N"], Course]:
+def over_steps(
+    one: Callable[[Any, Any], Any], carry: Any, records: Any, start: bool | Bool[Array, ""]
+) -> Any:
+    """The carry after one record and the next; at the start after the last one alone."""
+    count = jax.tree.leaves(records)[0].shape[0]
+    if isinstance(start, bool):
+        some = jax.tree.map(lambda x: x[-1:], records) if start else records
+        return lax.scan(lambda carry, record: (one(carry, record), None), carry, some)[0]
+    first = jnp.where(start, count - 1, 0)
+    return lax.fori_loop(first, count, lambda i, carry: one(carry, row(records, i)), carry)
+
+
+def paths(
+    lane_map: LaneMap,
+    slot: Int[Array, ""],
+    records: StepRecord,
+    start: bool | Bool[Array, ""] = False,
+) -> tuple[Bool[Array, " N"], Course]:
     """Of the records since a decision: paths that may meet that of the ego in `slot`, and when they do.
 
     Times of meeting are in s since the start of the world. Of vehicles that come nowhere near on straight
-    lines, or keep to other lanes, they are not known, and do not count.
+    lines, or keep to other lanes, they are not known, and do not count. At the start no paths are known, and
+    all may meet.
     """
     flow, way = records.traffic, records.way[0]
     now = jax.tree.map(lambda x: x[0], records.aside)
     vehicles = OnLanes(way, flow.lane[0], flow.s[0], flow.v[0], records.ego.box[0], now, records.other[0])
     relevant = meets_ego(lane_map, slot, way, records.other.max(0))
     near = jax.vmap(comes_near, (None, 0, 0))(slot, records.ego.box, records.ego.velocity).any(0)
-    found = course(lane_map, slot, vehicles, near & (relevant | records.ego.changing[:, slot].any()))
-    return relevant, found._replace(meets=found.meets + flow.t[0])
+    changes = records.ego.changing[:, slot].any()
+    found = course(lane_map, slot, vehicles, near & (relevant | changes) & ~jnp.asarray(start))
+    return relevant | start, Course(
+        meets=jnp.where(start, NONE, found.meets + flow.t[0]),
+        follows=found.follows & ~jnp.asarray(start),
+        leads=found.leads & ~jnp.asarray(start),
+    )
 
 
 def _flow(metrics: TrafficMetrics, carry: TrafficCarry, step: TrafficStep) -> TrafficCarry:

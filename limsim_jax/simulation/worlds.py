@@ -9,57 +9,70 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int
+from jaxtyping import Int
 
 from limsim_jax.files import no_garbage_collection
 from limsim_jax.maps.lane_map import LaneMap
-from limsim_jax.simulation.rollout import KEPT, Measure, Result, Rollout, Started, started
+from limsim_jax.simulation.rollout import Carry, Kept, Measure, Result, Rollout, Seen, Started, drawn
 from limsim_jax.simulation.totals import Totals
 from limsim_jax.types import Scenario
 from limsim_jax.xla import (
+    begin_program,
     enable_compilation_cache,
     held_program,
-    hold_program,
-    keep_program,
     run_often,
     run_once,
-    shared_program,
     without_compilation_cache,
 )
+
+
+class Names(NamedTuple):
+    """All that programs depend on beside shapes; None: not known."""
+
+    sampling: str | None = None
+    running: str | None = None
+    measuring: str | None = None
+
+
+LOOKED_AT = 10
+"""Decisions of a replay before it is asked whether they are `enough`."""
 
 Given = Callable[[Int[np.ndarray, " B"]], tuple[Any, Int[np.ndarray, " B"]]]
 """Of seeds: what a sampler gets instead of keys, and the seeds of the policies."""
 
 
 def over_worlds(
-    one: Callable[[Any, Any], Any],
+    one: Callable[..., Any],
     mesh: Mesh,
     compiler_options: dict[str, Any] | None = None,
     *,
-    consumes: bool = False,
+    each: int = 1,
+    consumes: int | None = None,
 ) -> Any:
-    """A function of shared data and one world, for `[B, ...]` worlds.
+    """A function of one world for `[B, ...]` worlds.
 
-    The batch is divided among the devices of the mesh. `consumes`: the arrays of the worlds are used for
-    those of the result, and are gone. `compiler_options`: those of `run_often` by default.
+    Its arguments are shared data and `each` more of a world. The batch is divided among the devices of the
+    mesh. `consumes`: the arrays of this argument are used for those of the result, and are gone.
+    `compiler_options`: those of `run_often` by default.
     """
     everywhere, worlds = PartitionSpec(), PartitionSpec("worlds")
     many = jax.shard_map(
-        jax.vmap(one, in_axes=(None, 0)),
+        jax.vmap(one, in_axes=(None, *[0] * each)),
         mesh=mesh,
-        in_specs=(everywhere, worlds),
+        in_specs=(everywhere, *[worlds] * each),
         out_specs=worlds,
         check_vma=False,
     )
     here, there = (NamedSharding(mesh, spec) for spec in (everywhere, worlds))
     return jax.jit(
-        many, in_shardings=(here, there), out_shardings=there, donate_argnums=(1,) if consumes else (),
+        many, in_shardings=(here, *[there] * each), out_shardings=there,
+        donate_argnums=() if consumes is None else (consumes,),
         compiler_options=compiler_options or run_often(),
     )  # fmt: skip
 
@@ -67,7 +80,9 @@ def over_worlds(
 class Worlds:
     """Many worlds of one shape: compiled once, run in chunks over all local devices.
 
-    The same program runs whole chunks, and worlds decision by decision for a closer look.
+    The same programs run whole chunks, and worlds decision by decision for a closer look. One starts worlds,
+    one drives them, and one measures what was driven: the last two compile at the same time, and policies
+    share the last.
 
     Args:
       run: the rollout. What it records is there for `replay`.
@@ -75,8 +90,8 @@ class Worlds:
       sampler: scenario of a world from its key; of the same shapes for all keys.
       chunk: worlds per call; rounded up to a multiple of the number of devices.
       devices: all local devices by default.
-      names: all that the sampler and the run depend on beside shapes. Programs are kept on disk by these
-        names; where one is None, they are not.
+      names: all that the sampler, the run and its measure depend on beside shapes. Programs are kept on disk
+        by these names; where one is None, they are not.
       given: what the sampler gets instead of a key: of seeds `[B]`, arrays `[B, ...]` made on the host, and
         the seeds of the policies. None: keys are made from the seeds.
     """
@@ -89,7 +104,7 @@ class Worlds:
         *,
         chunk: int = 64,
         devices: Sequence[Any] | None = None,
-        names: tuple[str | None, str | None] = (None, None),
+        names: Names | None = None,
         given: Given | None = None,
     ) -> None:
         devices = list(jax.local_devices() if devices is None else devices)
@@ -102,58 +117,70 @@ class Worlds:
 
         self._given, self._sampler = given, sampler
 
-        def start(lane_map: LaneMap, of: Any) -> Started:
-            if given is None:
-                return started(run, lane_map, sampler, of)
-            values, seed = of
-            return started(run, lane_map, lambda _: sampler(values), seed)
+        def start(lane_map: LaneMap, of: Any) -> tuple[Started, Seen]:
+            scenario, key = drawn(sampler, of) if given is None else drawn(lambda _: sampler(of[0]), of[1])
+            carry, seen = run.before(lane_map, scenario.start)
+            return Started(scenario.schedule, key, carry), seen
 
-        def advance(shared: tuple[LaneMap, Int[Array, ""]], world: Started) -> tuple[Started, Result]:
-            lane_map, decisions = shared
-            result, carry = run.advance(lane_map, *world, decisions)
-            return world._replace(carry=carry), result
+        def drive(shared: Any, world: tuple[Any, Any], carry: Carry) -> tuple[Carry, Kept]:
+            return run.drive(shared[0], *world, carry, shared[1])
 
-        self.names = sampling, running = names
-        self._advance_name = None if running is None else f"{running} {self.chunk} {_shapes(lane_map)}"
-        self._start_name = None if sampling is None or running is None else f"{self._advance_name} {sampling}"
+        def look(shared: Any, world: tuple[Any, Seen], measured: Any) -> tuple[Any, Any]:
+            lane_map, decisions, start = shared
+            schedule, seen = world
+            return run.look(lane_map, schedule, measured, seen, decisions, start)
+
+        self.names = names = names or Names()
+        self._place = f"{self.chunk} {_shapes(lane_map)}"
+        self._start_name = _name(names.running, names.measuring, names.sampling, self._place)
+        self._drive_name: str | None = None  # known with the shapes of worlds
+        self._look_name: str | None = None
         self._start_jit: Any = over_worlds(start, self.mesh, run_once())
-        self._advance_jit: Any = over_worlds(advance, self.mesh, consumes=True)
+        self._drive_jit: Any = over_worlds(drive, self.mesh, each=2, consumes=2)
+        self._look_jit: Any = over_worlds(look, self.mesh, each=2, consumes=2)
         self._start: Any = None
-        self._advance: Any = None
+        self._drive: Any = None
+        self._look: Any = None
 
     def measuring(self, measure: Measure, name: str | None = None) -> Worlds:
-        """The same worlds, measured by something else; a program of their own.
+        """The same worlds, measured by something else; programs of their own.
 
-        `name`: all that the measure depends on; None: the program is not kept on disk.
+        `name`: all that the measure depends on; None: programs are not kept on disk.
         """
-        sampling, running = self.names
-        running = None if running is None or name is None else f"{running} measured by {name}"
         return Worlds(
             replace(self.rollout, measure=measure), self.lane_map, self._sampler, chunk=self.chunk,
-            devices=list(self.mesh.devices.flat), names=(sampling, running), given=self._given,
+            devices=list(self.mesh.devices.flat), names=self.names._replace(measuring=name),
+            given=self._given,
         )  # fmt: skip
 
     def compile(self) -> Worlds:
         """Get the programs ready; otherwise the first chunk does."""
-        if self._advance is not None:
+        if self._drive is not None:
             return self
         enable_compilation_cache()
+        names, lane_map, number = self.names, self.lane_map, np.int32(0)
         seeds = self._inputs(np.zeros(self.chunk, np.int32))
 
-        aside = contextlib.nullcontext() if self._advance_name is None else without_compilation_cache()
-        with ThreadPoolExecutor(1) as pool, no_garbage_collection(), aside:
-            start = held_program(self._start_name)
-            if start is None:
-                lowered = self._start_jit.lower(self.lane_map, seeds)
-                kept = pool.submit(lambda: keep_program(self._start_name, lowered.compile()))
-                worlds = lowered.out_info  # it compiles while the other program is traced
-            else:
-                kept, worlds = None, start.out_info
-            name = None if self._advance_name is None else f"{self._advance_name} {_shapes(worlds)}"
-            shared = self.lane_map, np.int32(0)
-            advance = shared_program(name, lambda: self._advance_jit.lower(shared, worlds).compile())
-            self._start = start if kept is None else hold_program(self._start_name, kept.result())
-            self._advance = advance
+        aside = contextlib.nullcontext() if self._start_name is None else without_compilation_cache()
+        with ThreadPoolExecutor(3) as pool, no_garbage_collection(), aside:
+            (worlds, seen), start = begin_program(
+                self._start_name, lambda: self._start_jit.lower(lane_map, seeds), pool
+            )
+            fixed, measured = (worlds.schedule, worlds.key), worlds.carry.measured
+            carry = worlds.carry._replace(measured=None)
+            place = self._place, _shapes((fixed, carry.state, measured, seen))
+            self._drive_name = _name(names.running, names.measuring, *place, _shapes(carry.memory))
+            self._look_name = None if measured is None else _name(names.measuring, *place)
+            list(pool.map(held_program, (self._drive_name, self._look_name)))  # from disk, both at a time
+            (_, kept), drive = begin_program(
+                self._drive_name, lambda: self._drive_jit.lower((lane_map, number), fixed, carry), pool
+            )
+            if measured is not None:
+                seen = kept.tree._replace(trace=None)
+                of = (lane_map, number, np.bool_(False)), (worlds.schedule, seen), measured
+                _, look = begin_program(self._look_name, lambda: self._look_jit.lower(*of), pool)
+                self._look = look()
+            self._start, self._drive = start(), drive()
         return self
 
     def start(self, seeds: Sequence[int]) -> Started:
@@ -167,19 +194,37 @@ class Worlds:
             raise ValueError(f"{len(seeds)} seeds at once; at most {self.chunk}")
         self.compile()
         padded = np.array([*seeds, *[seeds[-1]] * (self.chunk - len(seeds))], np.int32)
-        return self._start(self.lane_map, self._inputs(padded))
+        worlds, seen = self._start(self.lane_map, self._inputs(padded))
+        if self._look is None or seen.records is None:
+            return worlds
+        shared = self.lane_map, np.int32(1), np.bool_(True)
+        measured, _ = self._look(shared, (worlds.schedule, seen), worlds.carry.measured)
+        return worlds._replace(carry=worlds.carry._replace(measured=measured))
 
     def _inputs(self, seeds: Int[np.ndarray, " B"]) -> Any:
         """What the worlds of some seeds start from."""
         return jnp.asarray(seeds) if self._given is None else self._given(seeds)
 
     def advance(self, worlds: Started, decisions: int) -> tuple[Started, Result]:
-        """A chunk some decisions later, on the devices; `worlds` themselves are used up.
+        """A chunk some decisions later, on the devices; the carry of `worlds` is used up.
 
-        Records of the result are those of at most `KEPT` decisions.
+        Records are those of the last decisions, at most `Rollout.kept`: `[W, kept, decision_every, ...]`.
         """
         self.compile()
-        return self._advance((self.lane_map, np.int32(decisions)), worlds)
+        schedule, key, carry = worlds
+        measured, carry, found, left = carry.measured, carry._replace(measured=None), None, decisions
+        while True:
+            some = min(left, self.rollout.kept(carry.state))
+            carry, kept = self._drive((self.lane_map, np.int32(some)), (schedule, key), carry)
+            seen = kept.tree
+            if self._look is not None:
+                shared = self.lane_map, np.int32(some), np.bool_(False)
+                measured, found = self._look(shared, (schedule, seen._replace(trace=None)), measured)
+            left -= some
+            if not left:
+                break
+        result = Result(carry.state, carry.totals, seen.trace, found)
+        return Started(schedule, key, carry._replace(measured=measured)), result
 
     def run(self, worlds: Started, decisions: int | None = None) -> Result:
         """Run worlds `[W, ...]` to the horizon, or for some decisions.
@@ -215,11 +260,10 @@ class Worlds:
             kept = some if count is None else min(count, some)
             result, records, left = None, [], self.rollout.decisions if decisions is None else decisions
             while left:
-                more = min(left, KEPT)
+                more = min(left, LOOKED_AT, self.rollout.kept(worlds.carry.state))
                 chunk, result = self.advance(chunk, more)
-                trace = jax.device_get(result.trace)
-                steps = more * self.rollout.config.decision_every
-                records.append(jax.tree.map(lambda x: x[:kept, :steps].copy(), trace))  # noqa: B023
+                trace = jax.tree.map(lambda x: np.asarray(x)[:kept, :more], result.trace)  # noqa: B023
+                records.append(jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), trace))
                 left = 0 if enough is not None and enough(records[-1]) else left - more
             assert result is not None
             whole = jax.device_get(result._replace(trace=None))
@@ -254,6 +298,11 @@ class Worlds:
         """Totals of all worlds `[len(seeds)]`, on the host."""
         parts = [result.totals for _, result in self.chunks(seeds)]
         return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def _name(*parts: str | None) -> str | None:
+    """All that a program depends on; None if a part of it is not known."""
+    return None if None in parts else " ".join(part for part in parts if part is not None)
 
 
 def _shapes(tree: Any) -> str:

@@ -40,7 +40,7 @@ from limsim_jax.policies.several import Several
 from limsim_jax.simulation.ending import Watch
 from limsim_jax.simulation.rollout import Result, Rollout, decision_key, world_key
 from limsim_jax.simulation.trace import trace
-from limsim_jax.simulation.worlds import Given, Worlds
+from limsim_jax.simulation.worlds import Given, Names, Worlds
 from limsim_jax.sweeps.answers import Notes, of_rows
 from limsim_jax.sweeps.build import (
     demand_of,
@@ -151,11 +151,14 @@ class Episodes:
         if sumo is not None:
             drawn += sumo.tables
         sampling = None if sumo is not None and sumo.random else describe_program(source, *drawn)
+        self._drawn = jax.jit(self.sample)  # traced once for its size and the start of worlds
         self.world_bytes = self._memory(sampling)
         self.chunk = self._chunk() if chunk is None else chunk
         run = replace(self.rollout, record=trace, policy=CanBrake(self._policy))
-        names = sampling, describe_program(source, replace(run, horizon=1.0))  # programs run for any time
-        self.worlds = Worlds(run, self.lane_map, self.sample, chunk=self.chunk, names=names)
+        # programs run for any time, and what measures knows no policy
+        running = describe_program(source, replace(run, horizon=1.0, measure=None))
+        names = Names(sampling, running, describe_program(source, config, self._measure))
+        self.worlds = Worlds(run, self.lane_map, self._drawn, chunk=self.chunk, names=names)
         self.chunk = self.worlds.chunk
 
     @property
@@ -210,10 +213,11 @@ class Episodes:
         """
         layout, found = self.layout, copy.copy(self)
         found.__dict__.pop("_reruns", None)
-        started, run = self.worlds.names
+        names = self.worlds.names
+        started = None if names.sampling is None else f"numbers {names.sampling}"
         found.worlds = Worlds(
             self.worlds.rollout, self.lane_map, lambda values: self.sample(layout.draws(values)),
-            chunk=self.chunk, names=(None if started is None else f"numbers {started}", run), given=given,
+            chunk=self.chunk, names=names._replace(sampling=started), given=given,
         )  # fmt: skip
         return found
 
@@ -330,7 +334,7 @@ class Episodes:
         name = None if sampling is None else kept_on_disk.key("world", sampling)
         size = None if name is None else kept_on_disk.load(name)
         if size is None:
-            arrays = jax.tree.leaves(jax.eval_shape(self.sample, jax.random.key(0)))
+            arrays = jax.tree.leaves(jax.eval_shape(self._drawn, jax.random.key(0)))
             size = sum(math.prod(x.shape) * x.dtype.itemsize for x in arrays)
             if name is not None:
                 kept_on_disk.store(name, size)

@@ -19,7 +19,7 @@ from limsim_jax.simulation.trace import Trace
 from limsim_jax.simulation.worlds import Worlds
 from limsim_jax.statistics import Interval
 from limsim_jax.sweeps.coverage import Choice, Unseen, greedy_cover, growth, unseen
-from limsim_jax.sweeps.episode import Episodes
+from limsim_jax.sweeps.episode import Episodes, source_hash
 from limsim_jax.sweeps.identity import describe_program
 
 Floats = NDArray[np.float64]
@@ -404,7 +404,8 @@ class Counter:
         places = places_of(episodes.network, episodes.lane_map)
         self.possible = possible(domain, places, episodes.lane_map)
         measure = CountExposure(domain, places, episodes.egos)
-        self.worlds: Worlds = episodes.worlds.measuring(measure, describe_program(measure))
+        name = describe_program(source_hash(), episodes.rollout.config, measure)
+        self.worlds: Worlds = episodes.worlds.measuring(measure, name)
 
     def count(
         self,

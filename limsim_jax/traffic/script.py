@@ -172,24 +172,24 @@ def ordered_change(
 # ---- zones
 
 
-def lanes_now(config: Config, lane_map: LaneMap, schedule: Schedule, state: State) -> LaneMap:
-    """The map with the speed limits of this moment."""
+def lanes_now(config: Config, lane_map: LaneMap, schedule: Schedule, step: Int[Array, ""]) -> LaneMap:
+    """The map with the speed limits after some physics steps."""
     zones = None if schedule.script is None else schedule.script.zones
     if zones is None:
         return lane_map
-    there = zones.lanes & _in_force(config, zones, state)[:, None] & jnp.isfinite(zones.limit)[:, None]
+    there = zones.lanes & _in_force(config, zones, step)[:, None] & jnp.isfinite(zones.limit)[:, None]
     limit = jnp.min(jnp.where(there, zones.limit[:, None], jnp.inf), 0)
     return replace(lane_map, speed_limit=jnp.where(there.any(0), limit, lane_map.speed_limit))
 
 
-def _in_force(config: Config, zones: Zones, state: State) -> Bool[Array, " Z"]:
-    now = config.time(state.step)
+def _in_force(config: Config, zones: Zones, step: Int[Array, ""]) -> Bool[Array, " Z"]:
+    now = config.time(step)
     return (zones.begin <= now + _SAME) & (now + _SAME < zones.end)
 
 
 def grip(config: Config, zones: Zones, state: State) -> Float[Array, " N"]:
     """Acceleration (m/s^2) that the road allows each vehicle in any direction; inf on dry roads."""
-    there = zones.lanes.T[state.lane] & _in_force(config, zones, state)[None]
+    there = zones.lanes.T[state.lane] & _in_force(config, zones, state.step)[None]
     return _GRAVITY * jnp.min(jnp.where(there, zones.friction[None], jnp.inf), -1)
 
 

@@ -14,6 +14,7 @@ from limsim_jax.metrics.catalog import EGO, TRAFFIC
 from limsim_jax.metrics.measure import Metric
 from limsim_jax.metrics.observer import EvaluateEgo, EvaluateEgos, EvaluateTraffic
 from limsim_jax.metrics.reductions import on_host
+from limsim_jax.simulation.rollout import measured_start
 
 STEPS = 7
 
@@ -59,7 +60,7 @@ def program(evaluator: Any) -> Any:
     """Results over the steps after the first one, in decisions of two."""
 
     def all_of(lane_map, start, ticks):
-        carry = evaluator.init(CONFIG, lane_map, start)
+        carry = measured_start(evaluator, CONFIG, lane_map, start)
         records = jax.vmap(lambda tick: evaluator.record(CONFIG, lane_map, tick))(ticks)
         decisions = jax.tree.map(lambda x: x.reshape(STEPS // 2, 2, *x.shape[1:]), records)
 

@@ -37,6 +37,7 @@ from limsim_jax.metrics.record import meets_ego
 from limsim_jax.metrics.safety import NO_GAP
 from limsim_jax.metrics.step import EgoStep
 from limsim_jax.metrics.traffic import TrafficMetrics, TrafficStep
+from limsim_jax.simulation.rollout import measured_start
 from limsim_jax.types import Config, Status
 
 
@@ -379,7 +380,7 @@ def play(slot, ticks, records, metrics):
     ego, traffic = Recorder(), Recorder(metrics)
     watch = Watched().watch(ego, traffic)
     with jax.disable_jit():
-        carry = watch.init(CONFIG, crossing(), jax.tree.map(jnp.asarray, ticks[0].state))
+        carry = measured_start(watch, CONFIG, crossing(), jax.tree.map(jnp.asarray, ticks[0].state))
         carries = [carry]
         half = len(records) // 2
         for part in (records[:half], records[half:]):

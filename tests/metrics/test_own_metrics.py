@@ -17,6 +17,7 @@ from limsim_jax.metrics.ego import NAMES, EgoMetrics
 from limsim_jax.metrics.measure import Metric, Own, check_names
 from limsim_jax.metrics.observer import EvaluateEgo
 from limsim_jax.metrics.reductions import measured, on_host
+from limsim_jax.simulation.rollout import measured_start
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,7 +154,7 @@ def test_the_state_of_the_world_is_there_in_a_rollout():
 
     @jax.jit
     def all_of(lane_map, start, ticks):
-        carry = measure.init(CONFIG, lane_map, start)
+        carry = measured_start(measure, CONFIG, lane_map, start)
         records = jax.vmap(lambda tick: measure.record(CONFIG, lane_map, tick))(ticks)
         carry = measure.update(CONFIG, lane_map, carry, records)
         return measure.result(CONFIG, lane_map, carry)

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from limsim_jax.geometry import wrap_angle
 from limsim_jax.maps.lane_map import NO_LANE, LaneMap, pose, side_s, to_frenet, width
 from limsim_jax.policies.base import PolicyLike, sighted
-from limsim_jax.simulation.rollout import Measure
+from limsim_jax.simulation.rollout import Measure, measured_start
 from limsim_jax.simulation.totals import Stood, Totals, count, no_totals
 from limsim_jax.simulation.trace import Trace, trace
 from limsim_jax.traffic.collision import record as record_events
@@ -168,7 +168,7 @@ class SharedWorld:
         shapes = jax.eval_shape(self._move, lanes, state, memory, held, jnp.bool_(True), jax.random.key(0))[0]
         moved = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(state=state)
         stood = Stood(state.distance, jnp.zeros_like(state.distance))
-        measured = self.measure.init(self.config, lanes, state)
+        measured = measured_start(self.measure, self.config, lanes, state)
         return SharedCarry(state, moved, memory, no_totals(state), stood, measured)
 
     def tick(

@@ -29,7 +29,7 @@ from limsim_jax.scenarios.openscenario.storyboard import Scenario
 from limsim_jax.scenarios.openscenario.world import Play, world_of
 from limsim_jax.simulation.rollout import Result, Rollout
 from limsim_jax.simulation.trace import trace
-from limsim_jax.simulation.worlds import Worlds
+from limsim_jax.simulation.worlds import Names, Worlds
 from limsim_jax.sweeps.answers import Notes
 from limsim_jax.sweeps.build import policy_of
 from limsim_jax.sweeps.episode import Episodes, provenance_of, source_hash
@@ -146,9 +146,10 @@ class ScenarioEpisodes(Episodes):
         self.rollout = Rollout(config, Traffic(player=Play()), horizon, self._policy, measure=self._measure)
         self.world_bytes = 0
         watched, source = replace(self.rollout, record=trace, policy=CanBrake(self._policy)), source_hash()
-        names = (
+        names = Names(
             describe_program(source, "variants", *self.sizes),
-            describe_program(source, replace(watched, horizon=1.0)),  # programs run for any time
+            describe_program(source, replace(watched, horizon=1.0, measure=None)),  # for any time
+            describe_program(source, config, self._measure),
         )
         self.worlds = Worlds(
             watched, self.lane_map, lambda world: world, names=names,
