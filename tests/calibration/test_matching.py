@@ -41,7 +41,7 @@ def measured(flow, looks):
 
     @jax.jit
     def run(steps):
-        carry = flow.init(CONFIG, lane_map, _State(steps.lane[0]))
+        carry, _ = flow.init(CONFIG, lane_map, _State(steps.lane[0]))
         half = len(looks["t"]) // 2
         for part in (slice(None, half), slice(half, None)):  # two decisions
             carry = flow.update(CONFIG, lane_map, carry, jax.tree.map(lambda x, part=part: x[part], steps))
