@@ -32,7 +32,7 @@ from limsim_jax.maps.conflicts import (
 )
 from limsim_jax.maps.conflicts.build import MARGIN, VEHICLE_WIDTH
 from limsim_jax.maps.conflicts.table import ABSENT
-from limsim_jax.maps.conflicts.waiting import hold_back, stand_back
+from limsim_jax.maps.conflicts.waiting import hold_back, stand_back, stretches_across
 from limsim_jax.maps.network import Control, LaneType, Turn
 
 REACH = VEHICLE_WIDTH + MARGIN
@@ -153,12 +153,33 @@ def test_of_lanes_that_lie_over_each_other_the_one_on_the_way_out_goes_first(lea
     ],
 )
 def test_where_a_car_waits_inside_a_junction_it_is_in_the_way_of_no_path_with_priority(place, across, hold):
-    def row(prio, kind):
-        return [(overlap(begin, end, kind), prio, 0) for begin, end in across]
+    lane = straight("lane", (0.0, 0.0), 0.0, 30.0, junction="J")
 
-    assert hold_back(place, row(-1, ConflictType.CROSS)) == hold
+    def held(prio, kind):
+        row = [(overlap(begin, end, kind), prio, 0) for begin, end in across]
+        (found,) = stretches_across(network([lane]), [lane], [row])
+        return hold_back(place, found)
+
+    assert held(-1, ConflictType.CROSS) == hold
     for prio, kind in ((1, ConflictType.CROSS), (0, ConflictType.CROSS), (-1, ConflictType.MERGE)):
-        assert hold_back(place, row(prio, kind)) == place
+        assert held(prio, kind) == place
+
+
+def test_a_car_that_waits_at_the_second_piece_of_its_way_is_out_of_the_way_on_the_first():
+    """The end of the first piece and the begin of the second lie across a path with priority."""
+    first = straight("first", (0.0, 0.0), 0.0, 12.0, junction="J", successors=("second",))
+    second = straight("second", (12.0, 0.0), 0.0, 9.0, junction="J", predecessors=("first",))
+    other = straight("other", (50.0, 0.0), 0.0, 9.0, junction="J", successors=("second",))
+    one = [(overlap(11.5, 12.0, ConflictType.CROSS), -1, 0), (overlap(2.0, 7.0, ConflictType.CROSS), -1, 0)]
+    two = [(overlap(0.0, 4.0, ConflictType.CROSS), -1, 0)]
+    lanes = [first, second, other]
+    found = stretches_across(network(lanes), lanes, [one, two, []])
+    assert found[1] == [(0.0, 4.0), (-0.5, 0.0), (-10.0, -5.0)]
+    assert hold_back(0.0, found[1]) == -10.0  # -0.5 is in the way of the other one
+    assert hold_back(0.0, found[1][:2]) == -0.5
+    several = dataclasses.replace(second, predecessors=("first", "other"))
+    lanes = [first, several, other]
+    assert stretches_across(network(lanes), lanes, [one, two, []])[1] == [(0.0, 4.0)]
 
 
 def overlap(begin, end, kind):

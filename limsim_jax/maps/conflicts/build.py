@@ -9,7 +9,7 @@ import numpy as np
 from limsim_jax.maps.conflicts.overlaps import Overlap, connectors, find_overlaps
 from limsim_jax.maps.conflicts.priority import Decision, RightOfWay, Rule, movement_groups, without_cycles
 from limsim_jax.maps.conflicts.table import ABSENT, ConflictTable, ConflictType
-from limsim_jax.maps.conflicts.waiting import hold_back, waiting_points
+from limsim_jax.maps.conflicts.waiting import hold_back, stretches_across, waiting_points
 from limsim_jax.maps.network import Control, Network
 
 VEHICLE_WIDTH = 2.0
@@ -89,12 +89,13 @@ def build_conflicts(
     for way in network.movements:
         if way.via and way.via[0] in index:
             must_stop[index[way.via[0]]] |= way.control in (Control.STOP, Control.ALL_WAY_STOP)
+    across = stretches_across(network, lanes, entries)
     for k, row in enumerate(entries):
         row.sort(key=lambda entry: (entry[0].s_in, entry[0].s_out, entry[0].second))
         for c, (overlap, p, t) in enumerate(row):
             for name in (*stretches, "sweep", "f_sweep"):
                 floats[name][k, c] = getattr(overlap, name)
-            floats["hold"][k, c] = hold_back(overlap.s_in, row)
+            floats["hold"][k, c] = hold_back(overlap.s_in, across[k])
             ints["foe"][k, c], ints["type"][k, c] = overlap.second, overlap.type
             ints["prio"][k, c], ints["tie"][k, c] = p, t
         met = [o.s_out for o, _, _ in row if o.type in (ConflictType.CROSS, ConflictType.MERGE)]

@@ -61,7 +61,7 @@ def waiting_points(
     return waiting
 
 
-def hold_back(place: float, row: Sequence[tuple[Overlap, int, int]]) -> float:
+def hold_back(place: float, across: Sequence[tuple[float, float]]) -> float:
     """Where to wait before a place, out of the way of others.
 
     The last place (m) before it at which a car lies across no path that has priority over its own. Cars that
@@ -69,14 +69,37 @@ def hold_back(place: float, row: Sequence[tuple[Overlap, int, int]]) -> float:
 
     Args:
         place: m along the connector.
-        row: the conflicts of the connector, with their priority.
+        across: begin and end (m) of those paths, from `stretches_across`.
     """
-    across = [(o.s_in, o.s_out) for o, prio, _ in row if prio < 0 and o.type is ConflictType.CROSS]
     while True:
         lower = min((begin for begin, end in across if begin < place and end > place - CAR), default=place)
         if lower == place:
             return place
         place = lower
+
+
+def stretches_across(
+    network: Network, lanes: Sequence[Lane], entries: Sequence[Sequence[tuple[Overlap, int, int]]]
+) -> list[list[tuple[float, float]]]:
+    """Of every connector where it crosses paths with priority: begin and end, m from its start.
+
+    A way through a junction may have several pieces. What the pieces before have is below 0; where several
+    lead to a connector, only what it has itself counts.
+    """
+    index = {lane.id: k for k, lane in enumerate(lanes)}
+    own = [
+        [(o.s_in, o.s_out) for o, prio, _ in row if prio < 0 and o.type is ConflictType.CROSS]
+        for row in entries
+    ]
+    found = []
+    for lane, mine in zip(lanes, own, strict=True):
+        both, at, start = list(mine), lane, 0.0
+        while len(at.predecessors) == 1 and start > -CAR and at.predecessors[0] in index:
+            at = network.lanes[at.predecessors[0]]
+            start -= at.length
+            both += [(start + begin, start + end) for begin, end in own[index[at.id]]]
+        found.append(both)
+    return found
 
 
 def stand_back(
