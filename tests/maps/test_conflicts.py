@@ -28,6 +28,7 @@ from limsim_jax.maps.conflicts import (
     Overlap,
     build_conflicts,
     connectors,
+    find_overlaps,
     priority_cycles,
 )
 from limsim_jax.maps.conflicts.build import MARGIN, VEHICLE_WIDTH
@@ -163,6 +164,16 @@ def test_where_a_car_waits_inside_a_junction_it_is_in_the_way_of_no_path_with_pr
     assert held(-1, ConflictType.CROSS) == hold
     for prio, kind in ((1, ConflictType.CROSS), (0, ConflictType.CROSS), (-1, ConflictType.MERGE)):
         assert held(prio, kind) == place
+
+
+@pytest.mark.parametrize(("start", "heading", "kind"), [(0.0, 0.0, "MERGE"), (9.0, math.pi, "CROSS")])
+def test_lanes_that_end_side_by_side_merge_and_oncoming_ones_do_not(start, heading, kind):
+    """Both are near each other from end to end, so both stretches reach the ends of their lanes."""
+    one = straight("one", (0.0, 0.0), 0.0, 9.0, junction="J")
+    other = straight("other", (start, 2.0), heading, 9.0, junction="J")
+    (found,) = find_overlaps([one, other], 1.8, 0.5)
+    assert found.type is ConflictType[kind]
+    assert (found.s_in, found.s_out, found.f_in, found.f_out) == (0, 9, 0, 9)
 
 
 def test_a_car_that_waits_at_the_second_piece_of_its_way_is_out_of_the_way_on_the_first():

@@ -42,6 +42,7 @@ _KINK = 1.2  # rad, turn within `_SPOT`, also into the next lane, above which th
 _SPOT = 1.0  # m
 _KINK_SWING = 1.0  # m: ... as far as this
 _STEP = 0.25  # m, sampling of the centre lines
+_BESIDE = 5.0  # m, centre lines of lanes that end side by side
 _REACH = 200.0  # m, from a merge or split outside junctions, on which two lanes are compared
 _FRINGE = 25.0  # m at both ends of a lane outside junctions that may belong to a junction
 _STEP_ASIDE = 8.0  # m at the end of a lane that jumps aside to another one
@@ -523,7 +524,8 @@ def _classify(lanes: Sequence[Lane], overlaps: list[Overlap]) -> list[Overlap]:
             set(i.predecessors) & set(j.predecessors) and starts(o.first, o.s_in) and starts(o.second, o.f_in)
         )
         joins = ends(o.first, o.s_out) and ends(o.second, o.f_out)
-        if joins and (not parts or set(i.successors) & set(j.successors)):
+        same = bool(set(i.successors) & set(j.successors))
+        if joins and (same or (not parts and _side_by_side(i, j))):
             kinds.append(ConflictType.MERGE)
         else:
             beside = ConflictType.MERGE if i.carriageway == j.carriageway else ConflictType.CROSS
@@ -568,6 +570,13 @@ def _classify(lanes: Sequence[Lane], overlaps: list[Overlap]) -> list[Overlap]:
 
     found = [replace(o, type=kind) for o, kind in zip(overlaps, kinds, strict=True)]
     return [_level(lanes, o) for o in found]
+
+
+def _side_by_side(i: Lane, j: Lane) -> bool:
+    """Whether two lanes end beside each other, in about the same direction."""
+    apart = float(np.hypot(*(i.xyz[-1] - j.xyz[-1])[:2]))
+    turned = math.remainder(i.heading[-1] - j.heading[-1], math.tau)
+    return apart < _BESIDE and abs(turned) < math.pi / 2
 
 
 def _level(lanes: Sequence[Lane], o: Overlap) -> Overlap:
