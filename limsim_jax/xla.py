@@ -44,10 +44,10 @@ DIVIDING_PASS = "cpu-parallel-task-assigner"
 TREES_PASS = "tree_reduction_rewriter"
 """The pass of XLA that makes trees of windows of long reductions, without vector code."""
 
-PROGRAMS = 64
-"""Compiled programs that are kept on disk, of 5 to 20 MB each."""
+PROGRAMS = 96
+"""Compiled programs that are kept on disk, of 4 to 20 MB each."""
 
-HELD = 16
+HELD = 24
 """Programs that stay loaded in a process: a scenario and its replays under half a dozen policies."""
 
 _held: dict[Path, Any] = {}  # the last used one at the end
