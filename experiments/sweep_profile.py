@@ -117,12 +117,15 @@ def compiled(episodes: Episodes) -> tuple[list[str], dict[str, float]]:
         start = worlds._start_jit.lower(lane_map, worlds._inputs(np.zeros(worlds.chunk, np.int32)))
         before = {"trace and lower the start": time.perf_counter() - begin}
         worlds._start = start.compile()
-        begun, _ = start.out_info
+        begun, first = start.out_info
         carry = begun.carry._replace(measured=None)
         worlds._drive = made(worlds._drive_jit, (lane_map, none), (begun.schedule, begun.key), carry)
         seen = worlds._drive.out_info[1].tree._replace(trace=None)
         shared = lane_map, none, np.bool_(False)
-        worlds._look = made(worlds._look_jit, shared, (begun.schedule, seen), begun.carry.measured)
+        worlds._look = made(worlds._look_jit, shared, (begun.schedule, first, seen), begun.carry.measured)
+        worlds._nothing = jax.tree.map(
+            lambda x: jax.numpy.zeros(x.shape, x.dtype, device=x.sharding), (first, seen)
+        )
     return [worlds._drive.as_text(), worlds._look.as_text()], before | stages
 
 
@@ -163,7 +166,7 @@ def measure(name: str, decisions: int) -> dict[str, Any]:
 
     def look() -> Any:
         return jax.block_until_ready(
-            worlds._look((*shared, np.bool_(False)), (schedule, seen), carry.measured)
+            worlds._look((*shared, np.bool_(False)), (schedule, worlds._nothing[0], seen), carry.measured)
         )
 
     (_, kept), _, *driven = profiled(drive)

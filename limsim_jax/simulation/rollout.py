@@ -32,10 +32,10 @@ from limsim_jax.traffic.script import lanes_now
 from limsim_jax.types import Config, Scenario, Schedule, State
 from limsim_jax.xla import mapped_like, row, with_row
 
-KEPT = 30
+KEPT = 60
 """Decisions that many worlds run on before they are measured, at most."""
 
-_KEPT_ROWS = 2000  # rows of vehicles that decisions leave behind until then
+_KEPT_ROWS = 4000  # rows of vehicles that decisions leave behind until then
 
 _DRIVERS = 1  # for the errors of drivers, of all that is drawn from the key of a decision
 
@@ -185,17 +185,13 @@ class Rollout:
         stood = Stood(state.distance, jnp.full_like(state.distance, self.config.time(state.step)))
         return mapped_like(state.s, Carry(state, memory, no_totals(state), stood, measured))
 
-    def before(self, lane_map: LaneMap, state: State) -> tuple[Carry, Seen]:
-        """As `init`, but the start is not measured: what `look` needs for it, `[kept, ...]`."""
+    def before(self, lane_map: LaneMap, state: State) -> tuple[Carry, Any]:
+        """As `init`, but the start is not measured: the record of it, for `look`."""
         carry = replace(self, measure=None).init(lane_map, state)
-        seen = Seen(carry.state.step, self._over(carry.state), None, None)
-        if self.measure is not None:
-            measured, record = self.measure.init(self.config, lane_map, carry.state)
-            every = self.config.decision_every
-            of_all = jax.tree.map(lambda x: jnp.broadcast_to(x, (every, *x.shape)), record)
-            carry, seen = carry._replace(measured=measured), seen._replace(records=of_all)
-        kept = self.kept(carry.state)
-        return carry, jax.tree.map(lambda x: jnp.broadcast_to(x, (kept, *jnp.shape(x))), seen)
+        if self.measure is None:
+            return carry, None
+        measured, record = self.measure.init(self.config, lane_map, carry.state)
+        return carry._replace(measured=measured), record
 
     def kept(self, state: State) -> int:
         """Decisions that `drive` runs on at most: few where there are many vehicles."""
@@ -266,10 +262,20 @@ class Rollout:
         schedule: Schedule,
         measured: Any,
         seen: Seen,
+        first: Any,
         decisions: Int[Array, ""],
         start: Bool[Array, ""],
     ) -> tuple[Any, Any]:
-        """Measure what some decisions have left behind, or the start, from `before`.
+        """Measure what some decisions have left behind, or the start.
+
+        Args:
+          lane_map: where.
+          schedule: of the world.
+          measured: the carry of the measure.
+          seen: by `drive`, `[kept, ...]`.
+          first: the record of the start, by `before`; None: it does not count.
+          decisions: how many; 1 for the start.
+          start: whether to measure the start instead of what was seen.
 
         Returns:
           The carry of the measure, and what it has found so far.
@@ -277,7 +283,13 @@ class Rollout:
         assert self.measure is not None
 
         def one(i: Array, measured: Any) -> Any:
-            return self._look(lane_map, schedule, measured, row(seen, i), start)
+            now = row(seen, i)
+            if first is None:
+                return self._look(lane_map, schedule, measured, now)
+            records = jax.tree.map(lambda x, y: jnp.where(start, x[None], y), first, now.records)
+            if now.over is not None:
+                now = now._replace(over=now.over & ~start)
+            return self._look(lane_map, schedule, measured, now._replace(records=records), start)
 
         measured = lax.fori_loop(0, decisions, one, measured)
         return measured, self.measure.result(self.config, lane_map, measured)

@@ -117,18 +117,18 @@ class Worlds:
 
         self._given, self._sampler = given, sampler
 
-        def start(lane_map: LaneMap, of: Any) -> tuple[Started, Seen]:
+        def start(lane_map: LaneMap, of: Any) -> tuple[Started, Any]:
             scenario, key = drawn(sampler, of) if given is None else drawn(lambda _: sampler(of[0]), of[1])
-            carry, seen = run.before(lane_map, scenario.start)
-            return Started(scenario.schedule, key, carry), seen
+            carry, first = run.before(lane_map, scenario.start)
+            return Started(scenario.schedule, key, carry), first
 
         def drive(shared: Any, world: tuple[Any, Any], carry: Carry) -> tuple[Carry, Kept]:
             return run.drive(shared[0], *world, carry, shared[1])
 
-        def look(shared: Any, world: tuple[Any, Seen], measured: Any) -> tuple[Any, Any]:
+        def look(shared: Any, world: tuple[Any, Any, Seen], measured: Any) -> tuple[Any, Any]:
             lane_map, decisions, start = shared
-            schedule, seen = world
-            return run.look(lane_map, schedule, measured, seen, decisions, start)
+            schedule, first, seen = world
+            return run.look(lane_map, schedule, measured, seen, first, decisions, start)
 
         self.names = names = names or Names()
         self._place = f"{self.chunk} {_shapes(lane_map)}"
@@ -141,6 +141,7 @@ class Worlds:
         self._start: Any = None
         self._drive: Any = None
         self._look: Any = None
+        self._nothing: Any = None  # the record of a start, and what is seen, for calls that lack one of them
 
     def measuring(self, measure: Measure, name: str | None = None) -> Worlds:
         """The same worlds, measured by something else; programs of their own.
@@ -163,12 +164,12 @@ class Worlds:
 
         aside = contextlib.nullcontext() if self._start_name is None else without_compilation_cache()
         with ThreadPoolExecutor(3) as pool, no_garbage_collection(), aside:
-            (worlds, seen), start = begin_program(
+            (worlds, first), start = begin_program(
                 self._start_name, lambda: self._start_jit.lower(lane_map, seeds), pool
             )
             fixed, measured = (worlds.schedule, worlds.key), worlds.carry.measured
             carry = worlds.carry._replace(measured=None)
-            place = self._place, _shapes((fixed, carry.state, measured, seen))
+            place = self._place, _shapes((fixed, carry.state, measured, first))
             self._drive_name = _name(names.running, names.measuring, *place, _shapes(carry.memory))
             self._look_name = None if measured is None else _name(names.measuring, *place)
             list(pool.map(held_program, (self._drive_name, self._look_name)))  # from disk, both at a time
@@ -177,8 +178,11 @@ class Worlds:
             )
             if measured is not None:
                 seen = kept.tree._replace(trace=None)
-                of = (lane_map, number, np.bool_(False)), (worlds.schedule, seen), measured
+                of = (lane_map, number, np.bool_(False)), (worlds.schedule, first, seen), measured
                 _, look = begin_program(self._look_name, lambda: self._look_jit.lower(*of), pool)
+                self._nothing = jax.tree.map(
+                    lambda x: jnp.zeros(x.shape, x.dtype, device=x.sharding), (first, seen)
+                )
                 self._look = look()
             self._start, self._drive = start(), drive()
         return self
@@ -194,11 +198,11 @@ class Worlds:
             raise ValueError(f"{len(seeds)} seeds at once; at most {self.chunk}")
         self.compile()
         padded = np.array([*seeds, *[seeds[-1]] * (self.chunk - len(seeds))], np.int32)
-        worlds, seen = self._start(self.lane_map, self._inputs(padded))
-        if self._look is None or seen.records is None:
+        worlds, first = self._start(self.lane_map, self._inputs(padded))
+        if self._look is None or first is None:
             return worlds
-        shared = self.lane_map, np.int32(1), np.bool_(True)
-        measured, _ = self._look(shared, (worlds.schedule, seen), worlds.carry.measured)
+        shared, of = (self.lane_map, np.int32(1), np.bool_(True)), (worlds.schedule, first, self._nothing[1])
+        measured, _ = self._look(shared, of, worlds.carry.measured)
         return worlds._replace(carry=worlds.carry._replace(measured=measured))
 
     def _inputs(self, seeds: Int[np.ndarray, " B"]) -> Any:
@@ -219,7 +223,8 @@ class Worlds:
             seen = kept.tree
             if self._look is not None:
                 shared = self.lane_map, np.int32(some), np.bool_(False)
-                measured, found = self._look(shared, (schedule, seen._replace(trace=None)), measured)
+                of = schedule, self._nothing[0], seen._replace(trace=None)
+                measured, found = self._look(shared, of, measured)
             left -= some
             if not left:
                 break

@@ -69,7 +69,7 @@ from limsim_jax.traffic.vehicles import Population
 from limsim_jax.types import Config, Scenario, State
 
 _SHARE_OF_MEMORY = 0.25
-_TEMPORARIES = 12  # memory of a running world, in units of its arrays
+_TEMPORARIES = 80  # memory of a running world with what it leaves behind, in units of its arrays
 _WORLDS = {"cpu": 10, "gpu": 2000, "tpu": 2000}
 """Worlds per device and call, if memory allows: on CPUs more are hardly faster, and few seeds wait."""
 
