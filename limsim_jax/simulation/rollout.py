@@ -32,10 +32,10 @@ from limsim_jax.traffic.script import lanes_now
 from limsim_jax.types import Config, Scenario, Schedule, State
 from limsim_jax.xla import mapped_like, row, with_row
 
-KEPT = 60
+KEPT = 40
 """Decisions that many worlds run on before they are measured, at most."""
 
-_KEPT_ROWS = 4000  # rows of vehicles that decisions leave behind until then
+_KEPT_ROWS = 2600  # rows of vehicles that decisions leave behind until then
 
 _DRIVERS = 1  # for the errors of drivers, of all that is drawn from the key of a decision
 

@@ -40,7 +40,7 @@ class Names(NamedTuple):
     measuring: str | None = None
 
 
-LOOKED_AT = 10
+LOOKED_AT = 20
 """Decisions of a replay before it is asked whether they are `enough`."""
 
 Given = Callable[[Int[np.ndarray, " B"]], tuple[Any, Int[np.ndarray, " B"]]]
