@@ -171,7 +171,8 @@ class Worlds:
             carry = worlds.carry._replace(measured=None)
             place = self._place, _shapes((fixed, carry.state, measured, first))
             self._drive_name = _name(names.running, names.measuring, *place, _shapes(carry.memory))
-            self._look_name = None if measured is None else _name(names.measuring, *place)
+            ends = self.rollout.traffic.after_collision  # then it is seen when a world is over
+            self._look_name = None if measured is None else _name(names.measuring, ends, *place)
             list(pool.map(held_program, (self._drive_name, self._look_name)))  # from disk, both at a time
             (_, kept), drive = begin_program(
                 self._drive_name, lambda: self._drive_jit.lower((lane_map, number), fixed, carry), pool
