@@ -123,9 +123,6 @@ def compiled(episodes: Episodes) -> tuple[list[str], dict[str, float]]:
         seen = worlds._drive.out_info[1].tree._replace(trace=None)
         shared = lane_map, none, np.bool_(False)
         worlds._look = made(worlds._look_jit, shared, (begun.schedule, first, seen), begun.carry.measured)
-        worlds._nothing = jax.tree.map(
-            lambda x: jax.numpy.zeros(x.shape, x.dtype, device=x.sharding), (first, seen)
-        )
     return [worlds._drive.as_text(), worlds._look.as_text()], before | stages
 
 

@@ -9,6 +9,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -141,7 +142,6 @@ class Worlds:
         self._start: Any = None
         self._drive: Any = None
         self._look: Any = None
-        self._nothing: Any = None  # the record of a start, and what is seen, for calls that lack one of them
 
     def measuring(self, measure: Measure, name: str | None = None) -> Worlds:
         """The same worlds, measured by something else; programs of their own.
@@ -171,7 +171,7 @@ class Worlds:
             carry = worlds.carry._replace(measured=None)
             place = self._place, _shapes((fixed, carry.state, measured, first))
             self._drive_name = _name(names.running, names.measuring, *place, _shapes(carry.memory))
-            ends = self.rollout.traffic.after_collision  # then it is seen when a world is over
+            ends = str(self.rollout.traffic.after_collision == "end")  # then it is seen when a world is over
             self._look_name = None if measured is None else _name(names.measuring, ends, *place)
             list(pool.map(held_program, (self._drive_name, self._look_name)))  # from disk, both at a time
             (_, kept), drive = begin_program(
@@ -181,9 +181,6 @@ class Worlds:
                 seen = kept.tree._replace(trace=None)
                 of = (lane_map, number, np.bool_(False)), (worlds.schedule, first, seen), measured
                 _, look = begin_program(self._look_name, lambda: self._look_jit.lower(*of), pool)
-                self._nothing = jax.tree.map(
-                    lambda x: jnp.zeros(x.shape, x.dtype, device=x.sharding), (first, seen)
-                )
                 self._look = look()
             self._start, self._drive = start(), drive()
         return self
@@ -205,6 +202,12 @@ class Worlds:
         shared, of = (self.lane_map, np.int32(1), np.bool_(True)), (worlds.schedule, first, self._nothing[1])
         measured, _ = self._look(shared, of, worlds.carry.measured)
         return worlds._replace(carry=worlds.carry._replace(measured=measured))
+
+    @cached_property
+    def _nothing(self) -> tuple[Any, Seen]:
+        """A start and what is seen, for calls without them."""
+        first, seen = self._start.out_info[1], self._drive.out_info[1].tree._replace(trace=None)
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype, device=x.sharding), (first, seen))
 
     def _inputs(self, seeds: Int[np.ndarray, " B"]) -> Any:
         """What the worlds of some seeds start from."""

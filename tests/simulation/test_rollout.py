@@ -16,7 +16,7 @@ from limsim_jax.policies.area import AreaOfInterest
 from limsim_jax.policies.base import LikeTraffic
 from limsim_jax.policies.simple import FollowLane
 from limsim_jax.simulation.checkpoint import fork, load, save
-from limsim_jax.simulation.rollout import Rollout, world_key
+from limsim_jax.simulation.rollout import Kept, Rollout, world_key
 from limsim_jax.simulation.table import write_trace
 from limsim_jax.simulation.totals import count
 from limsim_jax.simulation.trace import trace
@@ -253,3 +253,12 @@ def test_bad_input_is_named():
         next(worlds().chunks([-1]))
     with pytest.raises(ValueError, match="chunk of 0"):
         Worlds(RUN, bundled("roundabout")[1], sampler(), chunk=0)
+
+
+def test_arrays_that_records_share_are_held_once():
+    box, speed = jnp.ones((2, 5)), jnp.zeros(2)
+    kept = Kept.of({"trace": (box, speed), "metrics": {"box": box, "same": jnp.zeros(2), "none": None}})
+    assert len(kept.arrays) == 3, "equal values are not the same array"
+    whole = jax.tree.map(lambda x: x + 1, kept).tree
+    assert whole["trace"][0] is whole["metrics"]["box"] and whole["metrics"]["none"] is None
+    np.testing.assert_array_equal(whole["trace"][1], [1, 1])

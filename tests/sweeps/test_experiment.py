@@ -217,6 +217,18 @@ def test_worlds_of_a_map_that_was_edited_start_by_a_program_of_their_own(write, 
     assert one[1:] == other[1:] and None not in one and one.sampling != other.sampling
 
 
+def test_worlds_that_end_at_a_contact_are_measured_by_a_program_of_their_own(write):
+    """That program sees which worlds are over; all others have no such array."""
+    names = {}
+    for after in ("stop", "end", "continue"):
+        text = f'horizon = 1.0\nslots = 8\n[traffic]\nvehicles = 4\nafter_collision = "{after}"'
+        (experiment,) = read_experiments(write(f'map = "roundabout"\nego = false\n{text}'))
+        episodes = Episodes(experiment, chunk=2)
+        assert episodes.run([1, 2]).metrics["traffic_entered"].tolist() == [4, 4]
+        names[after] = episodes.worlds._look_name
+    assert names["stop"] == names["continue"] != names["end"] and None not in names.values()
+
+
 WITHOUT_WAY_OUT = """<net version="1.20">
 <edge id="a" from="1" to="2"><lane id="a_0" index="0" speed="14" length="100" shape="0,0 100,0"/></edge>
 <edge id="b" from="2" to="3"><lane id="b_0" index="0" speed="14" length="90" shape="100,0 190,0"/></edge>
